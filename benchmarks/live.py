@@ -19,10 +19,9 @@ import numpy as np
 from dvr_scenes import print_table, read_scenes, write_rows
 
 from vvgt_cli.cameras.sets import pixel_width
-from vvgt_cli.conversion.file_layout import degree_of
 from vvgt_cli.conversion.fitting import fit, work_of
 from vvgt_cli.conversion.live import box_lighting, fog, fog_start, function_table, widen_narrow, with_values
-from vvgt_cli.conversion.opened import open_field
+from vvgt_cli.conversion.opened import degree_of, open_field
 from vvgt_cli.conversion.recolored import visible_cloud
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.stage import Work

@@ -23,8 +23,7 @@ from vvgt_cli.dvr import RenderSettings, Scene
 from vvgt_cli.errors import DataError
 from vvgt_cli.field.source import StyledVolume
 from vvgt_cli.gaussians import Gaussians, in_unit_frame
-from vvgt_cli.gaussians.formats import encoded, read_splats
-from vvgt_cli.gaussians.formats.choose import FORMATS
+from vvgt_cli.gaussians.formats import FORMATS, encoded, read_splats
 from vvgt_cli.gaussians.rules import Rule
 from vvgt_cli.score.viewing import PREVIEW_VIEWS
 from vvgt_cli.score.views import score_test_views

@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 
 from vvgt_cli.cameras import Camera, orbit_views
+from vvgt_cli.gaussians.formats.nodes import HALF_TURN
 from vvgt_cli.images import read_png
 
 PAGES = Path(__file__).parent / "viewers"
@@ -51,8 +53,11 @@ def shoot(
 
     A camera of None: from z = 3 of the viewer's own axes, y up.
 
-    Cameras are square, have their principal point in the middle, and are in the frame of the file.
+    Cameras are square, have their principal point in the middle, and are in the frame of the `.ply`, which a `.glb` of
+    ours turns.
     """
+    turn = HALF_TURN if file.suffix == ".glb" else np.eye(3)
+    cameras = [camera and replace(camera, rotation=camera.rotation @ turn) for camera in cameras]
     outputs = [folder / f"{viewer}-{file.stem}-{size}-{index}.png" for index in range(len(cameras))]
     job = {
         "viewer": viewer,

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from vvgt_cli.cameras import default_views, look_at
 from vvgt_cli.cameras.files import colmap_model
-from vvgt_cli.cameras.quaternions import quaternion
+from vvgt_cli.cameras.types import quaternion
 from vvgt_cli.gaussians.frames import rotations
 
 unit = st.floats(-1, 1)

@@ -17,8 +17,7 @@ from vvgt_cli.conversion.stages import TestViews, ViewingConditions
 from vvgt_cli.errors import DataError
 from vvgt_cli.field.digests import values_digest
 from vvgt_cli.gaussians import PlyOptions, read_ply, write_ply
-from vvgt_cli.gaussians.formats import encoded, read_splats
-from vvgt_cli.gaussians.formats.choose import FORMATS
+from vvgt_cli.gaussians.formats import FORMATS, encoded, read_splats
 from vvgt_cli.gaussians.header import Certificate, parse_header
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.stored import Stored

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from tests.stiff_scenes import build, function, smooth, step
-from vvgt_cli.checks import Case, CheckError, Figure, require, run_case, stiffness
+from vvgt_cli.checks import Case, CheckError, Figure, report, require, run_case
+from vvgt_cli.checks.report import measure_changes, measure_stiffness
 from vvgt_cli.checks.self_test import self_test_cases
-from vvgt_cli.checks.stiffness import measure_changes, measure_stiffness
 from vvgt_cli.dvr import Scene
-from vvgt_cli.gaussians.formats.choose import FORMATS
+from vvgt_cli.gaussians.formats import FORMATS
 from vvgt_cli.volume import Volume
 
 
@@ -124,5 +124,5 @@ def test_stiffness_of_a_grid_is_that_of_its_extinction():
 def test_slabs_change_no_figure(monkeypatch):
     scene = build(smooth(12), step(0.5))
     whole = measure_changes(scene)
-    monkeypatch.setattr(stiffness, "SLAB", 300)
+    monkeypatch.setattr(report, "SLAB", 300)
     assert measure_changes(scene) == whole

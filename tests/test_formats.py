@@ -16,10 +16,10 @@ import pytest
 from tests.refused import refused
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, in_unit_frame, read_ply, write_ply
-from vvgt_cli.gaussians.formats import encoded, format_of, read_splats, ready
-from vvgt_cli.gaussians.formats.choose import FORMATS
+from vvgt_cli.gaussians.formats import FORMATS, encoded, format_of, read_splats, ready
 from vvgt_cli.gaussians.formats.sog import ORDERS, QUARTERS, _product
 from vvgt_cli.gaussians.formats.splats import Splats, columns_of, gaussians_of, ply_bytes, splats_of
+from vvgt_cli.gaussians.frames import transform as turned_by
 from vvgt_cli.images import read_png
 from vvgt_cli.images.metrics import psnr
 
@@ -100,6 +100,21 @@ def test_harmonics_are_kept_each_in_its_place(known, degree):
 
 
 @suffix
+def test_no_one_and_unbounded_gaussians(known):
+    empty = cloud(2).take(np.zeros(0, int))
+    refused(DataError, "no Gaussians to write; expected at least one", encoded, known, empty, PlyOptions(), "a")
+    for count in (1, 3):
+        splats = splats_of(cloud(count + 1).take(np.arange(count)), PlyOptions(comments=False))
+        bad = np.full((1, 3), np.nan, np.float32)
+        other = replace(splats.take(np.arange(count)[[*range(count), 0]]), means=np.concatenate([splats.means, bad]))
+        with pytest.warns(UserWarning, match="1 "):
+            drawn = gaussians_of(other, "a")[0]  # a row of another program's file
+        after = known.read(encoded(known, drawn, PlyOptions(comments=False), "a"), "a")
+        assert len(after) == count
+        assert max(errors(drawn, gaussians_of(after, "a")[0])[:1]) < 2e-3
+
+
+@suffix
 def test_damaged_files_are_one_line(known, tmp_path):
     content = encoded(known, cloud(100), PlyOptions(), "a")
     path = tmp_path / f"a{known.suffix}"
@@ -177,29 +192,48 @@ def test_glb_is_what_the_specification_asks_for():
     (primitive,) = document["meshes"][0]["primitives"]
     assert primitive["mode"] == 0
     assert set(primitive["extensions"]["KHR_gaussian_splatting"]) >= {"kernel", "colorSpace"}
-    for accessor in document["accessors"]:
+    for index, accessor in enumerate(document["accessors"]):
         view = document["bufferViews"][accessor["bufferView"]]
         width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
-        assert view["byteLength"] == 4 * width * accessor["count"] == 4 * width * 33
+        packed = index == primitive["attributes"]["COLOR_0"]
+        assert (accessor["componentType"], accessor.get("normalized", False)) == (
+            (5123, True) if packed else (5126, False)
+        )
+        assert view["byteLength"] == (2 if packed else 4) * width * accessor["count"] == view["byteLength"] // 33 * 33
+        assert view["byteLength"] // 33 % 4 == view["byteOffset"] % 4 == 0
     assert sum(view["byteLength"] for view in document["bufferViews"]) == document["buffers"][0]["byteLength"]
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_glb_names_every_harmonic_as_the_specification_does(degree):
-    """Degree l has the coefficients 0 to 2 l, in the order of the columns of a `.ply`."""
+def test_glb_holds_the_data_turned_as_gltf_has_them(degree):
+    """Degree l has the coefficients 0 to 2 l, in the order of the columns of a `.ply`; the root node turns nothing."""
     plain = cloud(5)
     terms = np.random.default_rng(1).normal(size=(5, (degree + 1) ** 2 - 1, 3)).astype(np.float32)
-    content = encoded(format_of("a.glb"), replace(plain, harmonics=terms if degree else None), PlyOptions(), "a.glb")
+    before = replace(plain, harmonics=terms if degree else None)
+    content = encoded(format_of("a.glb"), before, PlyOptions(), "a.glb")
     (size,) = struct.unpack_from("<I", content, 12)
     document, binary = json.loads(content[20 : 20 + size]), content[28 + size :]
+    assert document["nodes"] == [{"name": "Splats", "mesh": 0}]
     attributes = document["meshes"][0]["primitives"][0]["attributes"]
-    found = {name.split(":")[1]: index for name, index in attributes.items() if ":SH_" in name}
+    found = {name.split(":")[-1]: index for name, index in attributes.items()}
     names = [f"SH_DEGREE_{band}_COEF_{m}" for band in range(degree + 1) for m in range(2 * band + 1)]
-    assert sorted(found) == sorted(names)
-    for name, expected in zip(names[1:], np.moveaxis(terms, 1, 0), strict=True):
+    assert sorted(name for name in found if "SH_" in name) == sorted(names)
+
+    def column(name: str, kind: str = "<f4") -> np.ndarray:
         view = document["bufferViews"][document["accessors"][found[name]]["bufferView"]]
-        values = np.frombuffer(binary, "<f4", 15, view["byteOffset"]).reshape(5, 3)
-        np.testing.assert_allclose(np.sort(values, axis=0), np.sort(expected, axis=0), atol=1e-6)
+        values = np.frombuffer(binary, kind, view["byteLength"] // np.dtype(kind).itemsize, view["byteOffset"])
+        return values.reshape(5, -1)
+
+    expected = turned_by(before, np.diag([-1.0, -1, 1]))  # solved on directions, for any rotation
+    np.testing.assert_allclose(column("POSITION"), expected.means, atol=1e-6)
+    same = (column("ROTATION")[:, [3, 0, 1, 2]] * unit(expected.quaternions)).sum(axis=1)
+    np.testing.assert_allclose(abs(same), 1, atol=1e-6)
+    for m, name in enumerate(names[1:]):
+        np.testing.assert_allclose(column(name), expected.harmonics[:, m], atol=1e-5)
+    light = column("COLOR_0", "<u2") / 65535
+    shown = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
+    np.testing.assert_allclose(shown[:, :3], np.clip(plain.colors, 0, 1), atol=1e-4)
+    np.testing.assert_allclose(light[:, 3], column("OPACITY")[:, 0], atol=1e-5)
 
 
 def test_a_usd_stage_is_turned_upright():
@@ -218,6 +252,24 @@ def test_a_usd_stage_is_turned_upright():
         assert UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y
         up = UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(0).TransformDir((0, -1, 0))
         assert tuple(round(v, 6) for v in up) == (0, 1, 0)  # PLY -y is up
+
+
+@pytest.mark.parametrize(("rule", "order"), [("spark", "cameraDistance"), ("inria", "zDepth"), (None, "zDepth")])
+def test_a_usd_prim_says_how_it_is_drawn_and_is_valid(rule, order, tmp_path):
+    validation = pytest.importorskip("pxr.UsdValidation")  # in usd-core from 25.11 on
+    from pxr import Usd
+
+    (tmp_path / "a.usdz").write_bytes(
+        encoded(format_of("a.usdz"), cloud(20), PlyOptions(rule=rule, screen_size=9 if rule else None), "a")
+    )
+    stage = Usd.Stage.Open(str(tmp_path / "a.usdz"))
+    prim = stage.GetDefaultPrim()
+    hints = [prim.GetAttribute(f"{name}ModeHint") for name in ("sorting", "projection")]
+    assert [(hint.Get(), hint.HasAuthoredValue()) for hint in hints] == [(order, True), ("perspective", True)]
+    assert Usd.ColorSpaceAPI.ComputeColorSpaceName(prim, None) == "srgb_rec709_scene"
+    registry = validation.ValidationRegistry()
+    said = validation.ValidationContext(registry.GetOrLoadAllValidators()).Validate(stage)
+    assert [error.GetMessage() for error in said] == []
 
 
 def test_convert_reports_the_error_of_the_format(tmp_path, vvgt):
@@ -298,24 +350,11 @@ def test_splat_transform_reads_what_is_written(ending, transform, tmp_path):
 
 
 def test_glb_holds_what_splat_transform_writes(transform, tmp_path):
-    """The other writer of the extension; it turns the data, where ours turns the node."""
+    """The other writer of the extension, which turns the data as ours does."""
     before = cloud()
     write_ply(tmp_path / "a.ply", before, PlyOptions())
     subprocess.run([*transform, tmp_path / "a.ply", tmp_path / "b.glb"], check=True, capture_output=True)
-    content = (tmp_path / "b.glb").read_bytes()
-    size = struct.unpack_from("<I", content, 12)[0]
-    document = json.loads(content[20 : 20 + size])
-    document["nodes"] = [{"mesh": 0, "rotation": [0.0, 0.0, 1.0, 0.0]}]
-    head = json.dumps(document).encode()
-    head += b" " * (-len(head) % 4)
-    turned = content[:12] + struct.pack("<2I", len(head), 0x4E4F534A) + head + content[20 + size :]
-    theirs = gaussians_of(format_of("b.glb").read(turned, "b.glb"), "b.glb")[0]
-    half = Gaussians(  # 180 degrees about z
-        before.means * (-1, -1, 1), before.log_scales, unit(before.quaternions) @ np.array(
-            [[0, 0, 0, 1], [0, 0, 1, 0], [0, -1, 0, 0], [-1, 0, 0, 0]]
-        ), before.opacity_logits, before.colors,
-    )  # fmt: skip
-    assert max(errors(half, theirs)) < 1e-5
+    assert max(errors(before, read_splats(tmp_path / "b.glb")[0])) < 1e-5
 
 
 def test_spz_4_of_splat_transform_is_read(transform, tmp_path):
@@ -370,7 +409,32 @@ def test_a_stream_of_spz_4_that_ends_early_is_one_line():
     refused(DataError, r"stream 0: truncated; expected 540 bytes", known.read, changed + content[end:], "a.spz")
 
 
-@pytest.mark.parametrize(("at", "value"), [(4, 5), (12, 4), (15, 1), (16, 200), (19, 255), (60, 255)])
+@pytest.mark.parametrize("ending", [".spz", ".v4.spz"])
+def test_harmonics_beyond_what_spz_holds_are_cut_off_not_wrapped(ending):
+    known, base = format_of(f"a{ending}"), splats_of(cloud(60), PlyOptions(comments=False))
+    rest = np.random.default_rng(0).uniform(-3, 3, (60, 8, 3)).astype(np.float32)
+    found = known.read(known.write(replace(base, f_rest=rest), "a"), "a").f_rest
+    assert abs(found - np.clip(rest, -1, 127 / 128)).max() <= 1 / 256 + 1e-6
+
+
+def test_spz_4_of_degree_4_and_with_reserved_bytes_is_read():
+    zstd, known = pytest.importorskip("numcodecs.zstd"), format_of("a.v4.spz")
+    rest = np.random.default_rng(0).uniform(-0.9, 0.9, (60, 15, 3)).astype(np.float32)
+    content = known.write(replace(splats_of(cloud(60), PlyOptions(comments=False)), f_rest=rest), "a")
+    table = struct.unpack_from("<I", content, 16)[0]
+    size = struct.unpack_from("<Q", content, table + 80)[0]
+    bytes_of = np.frombuffer(zstd.decompress(content[-size:]), "u1").reshape(60, 45)
+    more = bytes(zstd.compress(np.pad(bytes_of, ((0, 0), (0, 27)), constant_values=7).tobytes(), 1))
+    front = content[:12] + b"\4" + content[13:20] + b"\xff" * 12 + content[32 : table + 80]
+    changed = front + struct.pack("<QQ", len(more), 60 * 72) + content[table + 96 : -size] + more
+    with pytest.warns(UserWarning, match="^a: harmonics of degree 4 are left out$"):
+        after = known.read(changed, "a")
+    before = known.read(content, "a")
+    assert after.f_rest.tobytes() == before.f_rest.tobytes()
+    assert after.means.tobytes() == before.means.tobytes()
+
+
+@pytest.mark.parametrize(("at", "value"), [(4, 5), (12, 5), (15, 1), (16, 200), (19, 255), (60, 255)])
 def test_damaged_headers_of_spz_4_are_one_line(at, value, tmp_path):
     known = format_of("a.v4.spz")
     content = bytearray(known.write(splats_of(cloud(60), PlyOptions(comments=False)), "a"))

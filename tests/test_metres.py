@@ -44,11 +44,8 @@ def gltf_points(content: bytes) -> tuple[np.ndarray, dict]:
     document = json.loads(content[20 : 20 + size])
     (node,) = document["nodes"]
     points = np.frombuffer(content, "<f4", 3 * document["accessors"][0]["count"], 28 + size).reshape(-1, 3)
-    x, y, z, w = node["rotation"]
-    q = np.array([x, y, z])
-    points = points.astype(np.float64) * node.get("scale", [1, 1, 1])
-    turned = points + 2 * np.cross(q, np.cross(q, points) + w * points)
-    return turned + node.get("translation", [0, 0, 0]), node
+    assert "rotation" not in node
+    return points.astype(np.float64) * node.get("scale", [1, 1, 1]) + node.get("translation", [0, 0, 0]), node
 
 
 def usd_points(content: bytes, path) -> tuple[np.ndarray, dict]:
@@ -98,7 +95,7 @@ def test_other_units_and_none(unit, metre):
     gaussians, world = marks()
     points, node = gltf_points(encoded(format_of("a.glb"), gaussians, layout(PlyOptions(), volume), "a"))
     if metre is None:
-        assert set(node) == {"name", "mesh", "rotation"}
+        assert set(node) == {"name", "mesh"}
         assert points == pytest.approx(gaussians.means * [-1, -1, 1])
     else:
         assert points * [-1, -1, 1] / metre == pytest.approx(world, rel=1e-5)
@@ -107,7 +104,7 @@ def test_other_units_and_none(unit, metre):
 
 def test_no_comments_no_place():
     content = encoded(format_of("a.glb"), marks()[0], layout(PlyOptions(comments=False), VOLUME), "a")
-    assert set(gltf_points(content)[1]) == {"name", "mesh", "rotation"}
+    assert set(gltf_points(content)[1]) == {"name", "mesh"}
     assert b"-1043" not in content
     assert placed((), "a").world is None
 
@@ -121,23 +118,22 @@ def changed(content: bytes, change) -> bytes:
     return content[:12] + struct.pack("<2I", len(head), 0x4E4F534A) + head + content[20 + size :]
 
 
-def test_files_of_before_are_read_and_moved_ones_refused(tmp_path):
+def test_files_without_metres_are_read_and_moved_ones_refused(tmp_path):
     gaussians, _ = marks()
     content = encoded(format_of("a.glb"), gaussians, layout(PlyOptions(), VOLUME), "a")
     read = format_of("a.glb").read
 
-    def before(node):
+    def plain(node):
         for key in ("scale", "translation", "extras"):
             del node[key]
 
     def as_matrix(node):
         s, t = node.pop("scale")[0], node.pop("translation")
-        del node["rotation"]
-        node["matrix"] = [-s, 0, 0, 0, 0, -s, 0, 0, 0, 0, s, 0, *t, 1]
+        node["matrix"] = [s, 0, 0, 0, 0, s, 0, 0, 0, 0, s, 0, *t, 1]
 
-    for change in (before, as_matrix):
+    for change in (plain, as_matrix):
         assert read(changed(content, change), "a").means == pytest.approx(gaussians.means)
-    for key, value in (("translation", [0, 0, 1]), ("rotation", [0, 0, 0, 1]), ("scale", [1, 1, 2])):
+    for key, value in (("translation", [0, 0, 1]), ("rotation", [0, 0, 1, 0]), ("scale", [1, 1, 2])):
         with pytest.raises(DataError, match="moved by another program"):
             read(changed(content, lambda node, key=key, value=value: node.update({key: value})), "a")
 

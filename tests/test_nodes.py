@@ -73,7 +73,8 @@ def middle(path: Path, node: dict) -> np.ndarray:
     root = whole["nodes"][0]
     box = whole["accessors"][whole["meshes"][node["mesh"]]["primitives"][0]["attributes"]["POSITION"]]
     data = (np.array(box["min"]) + box["max"]) / 2 + node["translation"]
-    scene = data * [-1, -1, 1] * root["scale"] + root["translation"]  # half a turn about z
+    assert "rotation" not in root
+    scene = data * root["scale"] + root["translation"]
     world = np.reshape(root["extras"]["worldFromScene"], (4, 4))
     return world[:3, :3] @ scene + world[:3, 3]
 

@@ -5,7 +5,6 @@ import pytest
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.ply import opacity
 from vvgt_cli.refine import OptimizeOptions, optimize
 from vvgt_cli.refine.states import DENSE, FAINTEST, SHRINK, SLOPE, Densified, densify
 from vvgt_cli.splat import render
@@ -40,8 +39,8 @@ def test_small_ones_are_cloned_and_large_ones_split_where_the_slope_is_steep(sig
     np.testing.assert_array_equal(denser.means[rest], g.means[rest])
     if sigma < DENSE * EXTENT:
         np.testing.assert_array_equal(denser.means[60:], g.means[steep])
-        both = 1 - (1 - opacity(denser)[steep]) * (1 - opacity(denser)[60:])
-        np.testing.assert_allclose(both, opacity(g)[steep], rtol=1e-5)
+        both = 1 - (1 - denser.opacity[steep]) * (1 - denser.opacity[60:])
+        np.testing.assert_allclose(both, g.opacity[steep], rtol=1e-5)
         assert (origin[:60] == np.arange(60)).all()
     else:
         np.testing.assert_allclose(denser.log_scales[60:], g.log_scales[steep] - np.log(SHRINK), rtol=1e-6)
@@ -92,8 +91,8 @@ def test_opacities_are_reset_where_there_is_time_to_recover():
     target = views(g)
     state.taken = 400
     state.step(CAMERAS[0], target[0], 0.1, 1.0)
-    assert opacity(state.gaussians()).max() < 0.0101
+    assert state.gaussians().opacity.max() < 0.0101
     short = Densified(g, CAMERAS, options)
     short.taken = 20
     short.step(CAMERAS[0], target[0], 0.1, 1.0)
-    assert opacity(short.gaussians()).max() > 0.3
+    assert short.gaussians().opacity.max() > 0.3

@@ -63,7 +63,7 @@ def test_several_are_drawn_listed_linked_saved_and_removed(dots: str, person: Pe
     ]  # fmt: skip
     for text, x, y in before:
         if text.startswith("3: ") and not person.touch:  # beside its place, above or below the angle's text
-            np.testing.assert_allclose([x - 8, y + 6], blue, atol=(2, 40))
+            assert (np.abs(np.subtract([x - 8, y + 6], blue)) <= (2, 40)).all()
     link = person("eval", "window.vvgt.where.link()")
     saved = tmp_path / "again.html"
     person("press", "m")

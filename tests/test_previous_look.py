@@ -11,7 +11,6 @@ import vvgt_cli as vvgt
 from tests.refused import refused
 from vvgt_cli.conversion.place import to_box_frame, to_unit_frame
 from vvgt_cli.conversion.previous_look import MAX_RATIO, OPAQUE, WARM_START, recolor_earlier
-from vvgt_cli.gaussians.ply import opacity
 
 GOAL = {"max_gaussians": 400, "screen": 96, "steps": 24}
 SPACING = (1.0, 1.0, 1.5)
@@ -142,7 +141,7 @@ def test_refused(session, earlier):
 def test_the_same_look_changes_nothing(session, earlier):
     field = earlier.field
     same, before = recolor_earlier(earlier, field), to_box_frame(earlier.gaussians, field.source.volume)
-    assert np.allclose(opacity(same), opacity(before).clip(*OPAQUE), atol=1e-6)
+    assert np.allclose(same.opacity, before.opacity.clip(*OPAQUE), atol=1e-6)
     assert np.allclose(same.colors, np.maximum(before.colors, 0), atol=1e-6)
     assert np.array_equal(same.means, before.means)
 
@@ -151,8 +150,8 @@ def test_depth_goes_with_extinction(session, earlier):
     thin = session.convert(shell(times=0.5), **{**GOAL, "steps": 0})
     found = recolor_earlier(earlier, thin.field)
     before = to_box_frame(earlier.gaussians, earlier.field.source.volume)
-    seen = (opacity(before) > 0.05) & (opacity(before) < 0.9)
-    ratio = np.log1p(-opacity(found)[seen]) / np.log1p(-opacity(before)[seen])
+    seen = (before.opacity > 0.05) & (before.opacity < 0.9)
+    ratio = np.log1p(-found.opacity[seen]) / np.log1p(-before.opacity[seen])
     assert np.median(ratio) == pytest.approx(np.log1p(-0.2) / np.log1p(-0.4), rel=0.15)
     assert ratio.min() >= 1 / MAX_RATIO
     assert replace(found, means=before.means).degree == 0

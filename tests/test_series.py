@@ -217,6 +217,10 @@ def test_another_series_is_refused_and_overwritten_on_request(vvgt, series: Path
     assert "01.ply exists, and no manifest" in vvgt(*run).error
     (series / "out" / "manifest.json").write_text("{}")
     assert "not a manifest of 'vvgt convert'" in vvgt(*run).error
+    (series / "pages").mkdir()
+    pages = replaced(run, "-o", series / "pages" / "{:02d}.html")
+    vvgt.ok(*pages, "--title", "before")
+    assert "title before there, after here" in vvgt(*pages, "--title", "after").error
 
 
 def test_calls_that_are_wrong(vvgt, series: Path) -> None:

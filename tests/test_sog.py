@@ -21,6 +21,7 @@ from vvgt_cli.gaussians.formats.sog import (
     SIZE,
     best_intervals,
     codebook,
+    edges,
     nearest_turn,
     palette,
     places_in,
@@ -110,6 +111,16 @@ def test_every_pixel_decodes_as_in_the_engine(degree: int) -> None:
         assert abs(opacity[0] - opacities[i]) <= 0.5 / 255 + 1e-6
         assert abs(np.array(harmonics[:3]) - before.f_dc[i]).max() < 0.01
         assert abs(ours[3:] - before.f_rest[i].ravel()).max(initial=0) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("count", "expected"),
+    [(1, (4, 4)), (17, (8, 4)), (4096**2, (4096, 4096)), (4096**2 + 1, (4100, 4096)), (1 << 26, (8192, 8192))],
+)
+def test_images_are_as_wide_as_high_up_to_4096_px(count: int, expected: tuple[int, int]) -> None:
+    """Many GPUs hold textures of 4,096 px, few of more than 16,384, which is WebP's limit, too."""
+    assert edges(count) == expected
+    assert expected[0] * expected[1] >= count
 
 
 def matrices(quaternions: np.ndarray, log_scales: np.ndarray) -> np.ndarray:

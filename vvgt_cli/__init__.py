@@ -42,8 +42,7 @@ if TYPE_CHECKING:
     from vvgt_cli.gaussians import Gaussians, PlyHeader
     from vvgt_cli.integrations.pyvista import export_plotter
     from vvgt_cli.library.inputs import Look
-    from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction, read_transfer_function
-    from vvgt_cli.look.lighting import LightOptions
+    from vvgt_cli.look import ColorMap, LightOptions, PiecewiseOpacity, TransferFunction, read_transfer_function
     from vvgt_cli.volume import Volume
 
 _WHERE = {  # imported on first use, so that `import vvgt_cli` costs nothing

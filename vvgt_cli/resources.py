@@ -83,7 +83,7 @@ def free_memory() -> int | None:
     of the process (RLIMIT_AS, RLIMIT_DATA), and of `set_memory` less what the process and its workers hold.
     Freed memory that the C library keeps counts as free.
     """
-    found = [
+    limits = [
         *_machine(),
         *(room for room in map(_free_in_group, _groups("memory")) if room is not None),
         *_own_limits(),
@@ -92,9 +92,9 @@ def free_memory() -> int | None:
         from multiprocessing import active_children
 
         others = (_table(PROC / str(child.pid) / "status") for child in active_children())  # idle workers
-        found.append(_asked - _status().get("VmRSS", 0) - sum(other.get("RssAnon", 0) for other in others))
+        limits.append(_asked - _status().get("VmRSS", 0) - sum(other.get("RssAnon", 0) for other in others))
     kept = 0 if _heap is None else max(_heap().fordblks - TOP_PAD, 0)  # the end of the heap may be untouched
-    return max(min(found) + kept, 0) if found else None
+    return max(min(limits) + kept, 0) if limits else None
 
 
 def processors() -> int:

@@ -1,6 +1,20 @@
 """Cameras and view sets."""
 
-from vvgt_cli.cameras.sets import default_views, farthest_cameras, fibonacci_views, look_at, orbit_views
+from vvgt_cli.cameras.blocks import BLOCK, FEW, Blocks, drawn_pixels, picked, spread_blocks
+from vvgt_cli.cameras.boxed import render_in_box, to_box_frame
+from vvgt_cli.cameras.sets import (
+    FIELD_OF_VIEW,
+    SET_VIEWS,
+    SIZE,
+    default_views,
+    farthest_cameras,
+    fibonacci_views,
+    look_at,
+    orbit_views,
+    pixel_width,
+)
 from vvgt_cli.cameras.types import Camera
 
-__all__ = ["Camera", "default_views", "farthest_cameras", "fibonacci_views", "look_at", "orbit_views"]
+__all__ = ["BLOCK", "FEW", "FIELD_OF_VIEW", "SET_VIEWS", "SIZE", "Blocks", "Camera", "default_views", "drawn_pixels"]
+__all__ += ["farthest_cameras", "fibonacci_views", "look_at", "orbit_views", "picked", "pixel_width", "render_in_box"]
+__all__ += ["spread_blocks", "to_box_frame"]

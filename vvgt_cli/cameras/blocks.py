@@ -35,9 +35,9 @@ class Blocks:
 
     def image(self, colors: np.ndarray) -> np.ndarray:
         """Return the picture (h, w, c) float32 with the ``colors`` (n, c) of the pixels of `mask`, zero elsewhere."""
-        found = np.zeros((self.height, self.width, colors.shape[1]), np.float32)
-        found[self.mask()] = colors
-        return found
+        picture = np.zeros((self.height, self.width, colors.shape[1]), np.float32)
+        picture[self.mask()] = colors
+        return picture
 
     def pick(self, image: np.ndarray) -> np.ndarray:
         """Stack the blocks of an image (h, w, c) vertically, (16 n, 16, c)."""

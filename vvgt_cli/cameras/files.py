@@ -21,8 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.cameras.quaternions import quaternion
-from vvgt_cli.cameras.types import Camera
+from vvgt_cli.cameras.types import Camera, quaternion
 from vvgt_cli.errors import DataError
 from vvgt_cli.files import read_text
 

@@ -20,7 +20,7 @@ from vvgt_cli.dvr import RenderSettings, Scene, render_view, render_view_referen
 from vvgt_cli.dvr.layers import Layer, grid_of
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_ply, as_stored, read_ply
-from vvgt_cli.gaussians.formats.choose import FORMATS, Format, encoded
+from vvgt_cli.gaussians.formats import FORMATS, Format, encoded
 from vvgt_cli.gaussians.rules import INRIA
 from vvgt_cli.images.metrics import score_views
 from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction
@@ -180,7 +180,7 @@ def bound_long_steps(scene: Scene, camera: Camera) -> Figure:
 def require_in_range(gaussians: Gaussians, scene: Scene, budget: int) -> None:
     """Require no more Gaussians than the budget, opacities and colours in range and centres in the box."""
     require(0 < len(gaussians) <= budget, f"{len(gaussians)} Gaussians for a budget of {budget}")
-    opacity = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
+    opacity = gaussians.opacity
     require(opacity.max() <= 0.9901, f"opacity {opacity.max():.6g}")
     require(gaussians.colors.min() >= -1e-6, f"colour {gaussians.colors.min():.3g}")
     require(gaussians.colors.max() <= 1 + 1e-6, f"colour {gaussians.colors.max():.3g}")

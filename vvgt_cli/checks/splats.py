@@ -10,12 +10,9 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.checks import Case, Figure
-from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.constants import MIN_ALPHA
+from vvgt_cli.gaussians import INRIA, MIN_ALPHA, Gaussians, Rule
 from vvgt_cli.gaussians.formats.splats import Splats
 from vvgt_cli.gaussians.frames import transform
-from vvgt_cli.gaussians.ply import opacity
-from vvgt_cli.gaussians.rules import INRIA, Rule
 from vvgt_cli.splat import project, render
 
 COLUMNS = {
@@ -63,7 +60,7 @@ def value_cases(gaussians: Gaussians, edge: float | None, size: int) -> Iterator
     if not edge:
         low, high = np.percentile(gaussians.means.astype(np.float64), (1, 99), axis=0)
         length = float((high - low).max() + 6 * np.median(sigma))
-    alpha, largest = opacity(gaussians), sigma.max(axis=1)
+    alpha, largest = gaussians.opacity, sigma.max(axis=1)
 
     def share(values: np.ndarray) -> float:
         return float(np.average(values, weights=np.maximum(alpha, 1e-12)))
@@ -99,12 +96,12 @@ def place_cases(
 
     def share(cloud: Gaussians) -> float:
         beyond = (np.abs(cloud.means.astype(np.float64)) > half + 2 * MARGIN).any(axis=1)
-        return float(np.average(beyond, weights=opacity(cloud) + 1e-12))
+        return float(np.average(beyond, weights=cloud.opacity + 1e-12))
 
     def outside() -> Figure:
-        found, other = share(gaussians), share(world)
-        hint = f" ({other:.2g} if read as world coordinates)" if other < found / 10 else ""
-        return Figure(f"share of the opacity{hint}", found, 0.002)
+        inside, other = share(gaussians), share(world)
+        hint = f" ({other:.2g} if read as world coordinates)" if other < inside / 10 else ""
+        return Figure(f"share of the opacity{hint}", inside, 0.002)
 
     def turned() -> Figure:
         error = {}

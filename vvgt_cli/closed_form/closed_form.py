@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera, default_views
-from vvgt_cli.cameras.sets import pixel_width
+from vvgt_cli.cameras import Camera, default_views, pixel_width
 from vvgt_cli.closed_form.fit import blending_weights, solve_colors, weights_and_errors
 from vvgt_cli.closed_form.lit import Shading
 from vvgt_cli.closed_form.moments import Cells, base_cells, exponents
@@ -28,10 +27,8 @@ from vvgt_cli.closed_form.tree import (
     value_score,
 )
 from vvgt_cli.closed_form.visibility import visibility
-from vvgt_cli.dvr.render import BoxFrame
-from vvgt_cli.dvr.scene import Scene
-from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.rules import INRIA, Rule
+from vvgt_cli.dvr import BoxFrame, Scene
+from vvgt_cli.gaussians import INRIA, Gaussians, Rule
 from vvgt_cli.progress import ProgressCallback
 from vvgt_cli.splat import render
 
@@ -113,9 +110,9 @@ class ClosedForm(Pyramid):
             return self.gaussians_of(leaves_of(self.tree, select(self.tree, self.budget, score)), ROUND)
         wanted = round(self.budget * min(seen**-SMALLER, 2.0))
         leaves = self.shaded(leaves_of(self.tree, select(self.tree, wanted, score)), self.whole)
-        found = self.blurred(leaves)
-        shown = np.flatnonzero(~unseen(blending_weights(found, cameras, rule), self.budget))
-        return self.sharpened(leaves.take(shown), found.take(shown))
+        blurred = self.blurred(leaves)
+        shown = np.flatnonzero(~unseen(blending_weights(blurred, cameras, rule), self.budget))
+        return self.sharpened(leaves.take(shown), blurred.take(shown))
 
     def refined(self, cameras: Sequence[Camera], views: np.ndarray, style: SurfaceStyle, rule: Rule) -> Gaussians:
         """Return Gaussians for the budget: three tenths by the moments, then cells with the largest error are split."""
@@ -330,6 +327,6 @@ def scores_by_error(tree: Tree, ids: np.ndarray, errors: np.ndarray, score: np.n
 
 def unseen(weights: np.ndarray, most: int) -> np.ndarray:
     """Return (n,) bool: whose blending ``weights`` (n,) are below `UNSEEN`, or not among the ``most`` largest."""
-    found: np.ndarray = weights < UNSEEN * weights.mean() if len(weights) else np.zeros(0, bool)
-    found[np.argsort(weights, kind="stable")[: max(len(weights) - most, 0)]] = True
-    return found
+    hidden: np.ndarray = weights < UNSEEN * weights.mean() if len(weights) else np.zeros(0, bool)
+    hidden[np.argsort(weights, kind="stable")[: max(len(weights) - most, 0)]] = True
+    return hidden

@@ -18,8 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from vvgt_cli.cameras import Camera
-from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.rules import INRIA, Rule
+from vvgt_cli.gaussians import INRIA, Gaussians, Rule
 from vvgt_cli.progress import ProgressCallback
 from vvgt_cli.splat import Projection, blend, gather, project, render
 from vvgt_cli.splat.render import seen_colors
@@ -120,9 +119,9 @@ class System:
 
 def _descend(system: System, views: np.ndarray, rounds: int, progress: ProgressCallback | None) -> np.ndarray:
     """Return the unknowns after conjugate gradients of `solve_colors`."""
-    found = system.start.copy()
-    rows = tuple(range(found.ndim - 1))  # all axes but the channels
-    residuals = [view[..., :3] - system.forward(i, found, view.shape) for i, view in enumerate(views)]
+    unknowns = system.start.copy()
+    rows = tuple(range(unknowns.ndim - 1))  # all axes but the channels
+    residuals = [view[..., :3] - system.forward(i, unknowns, view.shape) for i, view in enumerate(views)]
     gradient = system.back(residuals)
     direction = system.scaled(gradient)
     slope = (gradient * direction).sum(axis=rows)
@@ -132,7 +131,7 @@ def _descend(system: System, views: np.ndarray, rounds: int, progress: ProgressC
         curvature = sum((image.astype(np.float64) ** 2).sum(axis=(0, 1)) for image in images)
         curvature = curvature + (direction * system.pull(direction)).sum(axis=rows)
         length = np.where(curvature > 0, slope / np.where(curvature > 0, curvature, 1), 0)
-        found += length * direction
+        unknowns += length * direction
         gained = float((length * slope).sum())  # an exact line search lowers the squared error by this
         last = done == rounds - 1 or gained <= ENOUGH * error
         if progress:
@@ -142,12 +141,12 @@ def _descend(system: System, views: np.ndarray, rounds: int, progress: ProgressC
         error -= gained
         for residual, image in zip(residuals, images, strict=True):
             residual -= length.astype(np.float32) * image
-        gradient = system.back(residuals) - system.pull(found - system.start)
+        gradient = system.back(residuals) - system.pull(unknowns - system.start)
         scaled = system.scaled(gradient)
         new = (gradient * scaled).sum(axis=rows)
         direction = scaled + np.where(slope > 0, new / np.where(slope > 0, slope, 1), 0) * direction
         slope = new
-    return found
+    return unknowns
 
 
 def _fields(image: np.ndarray) -> np.ndarray:

@@ -38,11 +38,11 @@ def reach() -> float:
 
 def _radical(k: int, base: int) -> float:
     """Return the digits of k after the point, in reverse (van der Corput)."""
-    found, share = 0.0, 1.0 / base
+    digits, share = 0.0, 1.0 / base
     while k:
         k, digit = divmod(k, base)
-        found, share = found + digit * share, share / base
-    return found
+        digits, share = digits + digit * share, share / base
+    return digits
 
 
 @parallel_kernel("Voxels f8:2 f8:3 f8:2 i8:1 i8:1 i8:1 f8:1 f4:2 f8:2", TUPLES, fastmath=FLAGS, error_model="numpy")
@@ -123,8 +123,8 @@ def values_of(
     axes = rotations(gaussians.quaternions.astype(np.float64))
     gradient = np.einsum("kij,kj->ki", axes, rise / np.exp(gaussians.log_scales.astype(np.float64)))
     gradient *= (explained.clip(0, 1) / np.maximum(np.linalg.norm(gradient, axis=1), 1e-30))[:, None]
-    found = np.stack([mean * slope + intercept, spread * abs(slope)], axis=1)
-    return np.concatenate([found, normal_axis(sums), gradient], axis=1).astype(np.float32)
+    columns = np.stack([mean * slope + intercept, spread * abs(slope)], axis=1)
+    return np.concatenate([columns, normal_axis(sums), gradient], axis=1).astype(np.float32)
 
 
 def normal_axis(sums: np.ndarray) -> np.ndarray:

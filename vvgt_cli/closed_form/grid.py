@@ -26,7 +26,7 @@ def _row(values: np.ndarray, y: Between, z: Between, first: int, out: np.ndarray
     """
     j0, j1, fy, _ = y
     k0, k1, fz, _ = z
-    ny, nx, found = values.shape[1], values.shape[2], False
+    ny, nx, absorbs = values.shape[1], values.shape[2], False
     n00, n01, n10, n11 = (k0 * ny + j0) * nx, (k0 * ny + j1) * nx, (k1 * ny + j0) * nx, (k1 * ny + j1) * nx
     for m in range(out.shape[0]):
         i = min(max(first + m, 0), nx - 1)
@@ -35,8 +35,8 @@ def _row(values: np.ndarray, y: Between, z: Between, first: int, out: np.ndarray
         here = mix(near, far, fz)
         for c in range(4):
             out[m, c] = lane(here, c)
-        found = found or out[m, 3] > 0.0
-    return found
+        absorbs = absorbs or out[m, 3] > 0.0
+    return absorbs
 
 
 @_jit

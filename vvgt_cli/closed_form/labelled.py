@@ -48,13 +48,13 @@ def _rows(
     points = centres[:, None, :] + np.einsum("kij,mj->kmi", arms, offsets() * (wide / NARROW))
     index = np.rint(points).astype(np.int64)
     inside = ((index >= 0) & (index < np.array(maps[0][0].dims))).all(axis=2)
-    found, first = np.full((len(maps), *inside.shape), -1, np.int64), 0
+    rows, first = np.full((len(maps), *inside.shape), -1, np.int64), 0
     for layer, (volume, numbers) in enumerate(maps):
         values, known = values_at(volume, index[inside]), np.asarray(numbers, np.float64)
         at = np.minimum(np.searchsorted(known, values), len(known) - 1)
-        found[layer][inside] = np.where(known[at] == values, first + at, -1)
+        rows[layer][inside] = np.where(known[at] == values, first + at, -1)
         first += len(known)
-    return found
+    return rows
 
 
 def _label_assignment(rows: np.ndarray) -> np.ndarray:
@@ -75,7 +75,7 @@ def _gradients(gaussians: Gaussians, own: np.ndarray) -> np.ndarray:
     points = offsets()
     rise = (own - own.mean(axis=1, keepdims=True)) @ points @ np.linalg.inv(points.T @ points)
     axes = rotations(gaussians.quaternions.astype(np.float64))
-    found = np.einsum("kij,kj->ki", axes, rise / np.exp(gaussians.log_scales.astype(np.float64)))
-    length = np.linalg.norm(found, axis=1, keepdims=True)
-    result: np.ndarray = found / np.where(length > 1e-9, length, np.inf)
+    gradients = np.einsum("kij,kj->ki", axes, rise / np.exp(gaussians.log_scales.astype(np.float64)))
+    length = np.linalg.norm(gradients, axis=1, keepdims=True)
+    result: np.ndarray = gradients / np.where(length > 1e-9, length, np.inf)
     return result

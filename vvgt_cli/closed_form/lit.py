@@ -185,11 +185,11 @@ def mean_normals(gaussians: Gaussians, look_up: Callable[[np.ndarray], np.ndarra
     arms = axes_of(gaussians).transpose(0, 2, 1)  # (K, 3, 3)
     arms = np.concatenate([np.zeros_like(arms[:, :1]), arms, -arms], axis=1)
     points = (gaussians.means[:, None, :] + arms).reshape(-1, 3)
-    found = look_up(points)
+    samples = look_up(points)
     inside = (np.abs(points) < half).all(axis=1)
-    weight = np.where(inside, found[:, 3], 0)
+    weight = np.where(inside, samples[:, 3], 0)
     weight[::7] = np.maximum(weight[::7], 1e-12)  # where there is nothing, the direction at the centre
-    mean = (weight[:, None] * found[:, :3]).reshape(-1, 7, 3).sum(axis=1) / weight.reshape(-1, 7).sum(axis=1)[:, None]
+    mean = (weight[:, None] * samples[:, :3]).reshape(-1, 7, 3).sum(axis=1) / weight.reshape(-1, 7).sum(axis=1)[:, None]
     return directions(mean)
 
 
@@ -268,12 +268,12 @@ def highlights(
     projected = np.concatenate([np.full((AROUND, 1), SH_C0), basis(eyes, degree)], axis=1) * (4 * np.pi / AROUND)
     half = directions[:, None, :] - eyes
     half /= np.maximum(np.linalg.norm(half, axis=2, keepdims=True), 1e-9)
-    found = np.zeros((len(normals), 1 + HARMONICS[degree]))
+    harmonics = np.zeros((len(normals), 1 + HARMONICS[degree]))
     for start in range(0, len(normals), CHUNK):
         part = slice(start, start + CHUNK)
         main = np.linalg.eigh(normals[part])[1][:, :, 2]
         trace = np.trace(normals[part], axis1=1, axis2=2)
         for k in range(len(directions)):
             weight = (trace * arriving[part, k])[:, None]
-            found[part] += weight * (np.minimum(np.abs(main @ half[k].T), 1) ** power @ projected)
-    return found[:, 0] * SH_C0, found[:, 1:]
+            harmonics[part] += weight * (np.minimum(np.abs(main @ half[k].T), 1) ** power @ projected)
+    return harmonics[:, 0] * SH_C0, harmonics[:, 1:]

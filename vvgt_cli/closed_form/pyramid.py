@@ -156,10 +156,10 @@ class Pyramid(ABC):
 
     def blurred(self, leaves: Leaves, style: SurfaceStyle = ROUND) -> Gaussians:
         """Return the Gaussians of shaded leaves with the colours of their cells."""
-        found = cell_gaussians(leaves, float(self.step.min()), self.pixel, self.opaque, style)
+        gaussians = cell_gaussians(leaves, float(self.step.min()), self.pixel, self.opaque, style)
         if self.shading is None:
-            return found
-        return colored(found, self.shading.light, leaves.moments[:, COLUMNS:], self.degree)
+            return gaussians
+        return colored(gaussians, self.shading.light, leaves.moments[:, COLUMNS:], self.degree)
 
     def sharpened(self, leaves: Leaves, gaussians: Gaussians) -> Gaussians:
         """Apply `sharpened`, but not to labels: each is of one colour, and may be written to a file of its own."""

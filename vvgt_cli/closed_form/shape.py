@@ -10,8 +10,7 @@ from vvgt_cli.closed_form.cell_kernels import principal_axes
 from vvgt_cli.closed_form.columns import COLOR, MASS, SEEN, SEEN_COLOR
 from vvgt_cli.closed_form.surface_offset import Opaque, flattened, surface_offset
 from vvgt_cli.closed_form.tree import Leaves, central
-from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.constants import MAX_ALPHA
+from vvgt_cli.gaussians import MAX_ALPHA, Gaussians
 from vvgt_cli.gaussians.opacity import opacity_when_reshaped, peak_opacity
 
 FLOOR = 0.05  # smallest standard deviation, in the smaller of voxel and cell edge
@@ -94,8 +93,7 @@ def widened(gaussians: Gaussians, factor: float, pixel: float) -> Gaussians:
     """
     scales = np.exp(gaussians.log_scales.astype(np.float64))
     wider = np.where(scales > scales.min(axis=1, keepdims=True), factor * scales, scales)
-    before = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
-    opacity = np.clip(opacity_when_reshaped(before, scales**2, wider**2, pixel), LEAST_ALPHA, MAX_ALPHA)
+    opacity = np.clip(opacity_when_reshaped(gaussians.opacity, scales**2, wider**2, pixel), LEAST_ALPHA, MAX_ALPHA)
     return replace(gaussians, log_scales=np.log(wider), opacity_logits=np.log(opacity / (1 - opacity)))
 
 

@@ -94,11 +94,11 @@ def sharpened(gaussians: Gaussians, seen: np.ndarray, half: np.ndarray) -> Gauss
     mixed, front, around = np.empty_like(values), np.empty_like(values), np.empty(len(means))
     mix_neighbours(*curves(means, half), means, widths, areas, seen, values, mixed, front, around)
     hidden = np.clip(1 - seen / np.maximum(around, TINY), 0, 1).astype(np.float32)[:, None]
-    found = values + (1 - hidden) * AMOUNT * (values - mixed) + hidden * (front - values)
-    colors = np.clip(found[:, :3], DARKEST, np.maximum(BRIGHTEST, gaussians.colors))
+    sharp = values + (1 - hidden) * AMOUNT * (values - mixed) + hidden * (front - values)
+    colors = np.clip(sharp[:, :3], DARKEST, np.maximum(BRIGHTEST, gaussians.colors))
     if gaussians.harmonics is None:
         return replace(gaussians, colors=colors)
-    return replace(gaussians, colors=colors, harmonics=found[:, 3:].reshape(gaussians.harmonics.shape))
+    return replace(gaussians, colors=colors, harmonics=sharp[:, 3:].reshape(gaussians.harmonics.shape))
 
 
 def curves(means: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

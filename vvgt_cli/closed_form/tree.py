@@ -182,8 +182,8 @@ class Scores(NamedTuple):
 
     def leaves(self, threshold: float) -> np.ndarray:
         """Return which cells (n,) are leaves where all with a score above the threshold are split."""
-        found: np.ndarray = (self.above > threshold) & ((self.capped <= threshold) | ~self.inner)
-        return found
+        leaves: np.ndarray = (self.above > threshold) & ((self.capped <= threshold) | ~self.inner)
+        return leaves
 
 
 def select(tree: Tree, budget: int, score: np.ndarray | None = None) -> np.ndarray:
@@ -314,7 +314,7 @@ def split(tree: Tree, leaves: Leaves, order: np.ndarray, room: int, scene: Scene
 def _children_below(leaves: Leaves, scene: Scene, seen: Visibility) -> tuple[np.ndarray, Leaves]:
     """Return visible children of cells at or below a tree's base: their parents (n,), ascending, and themselves."""
     step = np.asarray(scene.step)
-    parents, found = [], []
+    parents, children = [], []
     for edge in np.unique(leaves.edge, axis=0):
         chosen = np.flatnonzero((leaves.edge == edge).all(axis=1))
         moments = cell_moments(scene, leaves.index[chosen] * (edge / step), edge / step)  # (n, 8, 13)
@@ -325,9 +325,9 @@ def _children_below(leaves: Leaves, scene: Scene, seen: Visibility) -> tuple[np.
         square = (own[:, COLOR] ** 2).sum(axis=1, keepdims=True) / np.maximum(own[:, [MASS]], np.finfo(np.float64).tiny)
         rows = np.concatenate([own, own[:, [MASS, RED, GREEN, BLUE]] * mean, square * mean], axis=1)
         parents.append(np.repeat(chosen, keep.sum(axis=1)))
-        found.append(
+        children.append(
             Leaves(rows, index[keep], np.broadcast_to(edge / 2, (len(rows), 3)), np.full(len(rows), -1, np.int64))
         )
     parent = np.concatenate(parents)
     order = np.argsort(parent, kind="stable")
-    return parent[order], Leaves.joined(found).take(order)
+    return parent[order], Leaves.joined(children).take(order)

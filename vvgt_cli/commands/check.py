@@ -35,9 +35,8 @@ def check(
     Raises:
         UsageError, DataError: a volume or Gaussians that cannot be read.
     """
-    from vvgt_cli.checks.report import CheckReport, run_cases
+    from vvgt_cli.checks.report import CheckReport, measure_stiffness, run_cases
     from vvgt_cli.checks.self_test import scene_cases, self_test_cases
-    from vvgt_cli.checks.stiffness import measure_stiffness
     from vvgt_cli.commands.check_splats import check_splats
     from vvgt_cli.field.source import describe_source, load, tf_record, volume_record
     from vvgt_cli.gaussians.formats import is_splats
@@ -55,9 +54,9 @@ def check(
     loaded = load(source)
     console.message(describe_source(loaded))
     scene = loaded.scene()
-    found = measure_stiffness(scene, tolerance or TOLERANCE, console.bar("stiffness"))
+    stiffness = measure_stiffness(scene, tolerance or TOLERANCE, console.bar("stiffness"))
     outcomes = run_cases(list(scene_cases(scene)), console)
-    return CheckReport(outcomes, volume_record(loaded), tf_record(loaded, source), found)
+    return CheckReport(outcomes, volume_record(loaded), tf_record(loaded, source), stiffness)
 
 
 @shared.command("check", short_help="Test this installation, how stiff a scene is, or a file of Gaussians.")

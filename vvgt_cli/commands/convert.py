@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from typing import TYPE_CHECKING, Any, Unpack
 
 import click
@@ -69,7 +68,7 @@ def convert(
         comments: write comments (frame, unit distance, certificate, ...) into the file.
         values: write the volume's values into a page.
         title: title of pages.
-        story: for a page to tell: a ``story.json`` or its content (docs/live.md); needs a page as ``output``.
+        story: for a page to tell: a ``story.json`` or its content (docs/page.md); needs a page as ``output``.
         report: JSON of times and errors to write.
         preview: PNG to write: volume, splats and difference.
         checkpoint: folder for the results of stages until the output is written.
@@ -91,17 +90,17 @@ def convert(
         UsageError: options contradict each other.
     """
     from vvgt_cli.conversion.convert_batch import convert_all
-    from vvgt_cli.conversion.gaussian_files import is_page
     from vvgt_cli.conversion.request import FitOptions, Limits
     from vvgt_cli.conversion.result import Conversion
     from vvgt_cli.errors import UsageError
     from vvgt_cli.gaussians import PlyOptions
+    from vvgt_cli.gaussians.formats import is_page
     from vvgt_cli.gaussians.story import read_story
     from vvgt_cli.library.inputs import console_of, requests_of
 
     if not isinstance(after, Conversion | None):
         raise UsageError("after: expected the result of convert for one volume and look")
-    if output is not None and not is_page(os.fspath(output)) and not values:
+    if output is not None and not is_page(output) and not values:
         raise UsageError(f"--no-values is for a page; got -o {output}; expected -o OUT.html")
     fit = FitOptions.of(
         target, max_gaussians=max_gaussians, screen=screen, init=init, rule=rule, seed=seed, steps=steps, model=model,

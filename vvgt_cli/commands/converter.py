@@ -25,9 +25,7 @@ from typing import IO, Any, cast
 from vvgt_cli.errors import DataError, VvgtError
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians.formats.page_values import Values
-from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.look.labels import LabelTable
-from vvgt_cli.look.lighting import LightOptions
+from vvgt_cli.look import LabelTable, LightOptions, TransferFunction
 from vvgt_cli.resources import memory_limit
 
 

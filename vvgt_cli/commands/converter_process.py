@@ -18,8 +18,7 @@ import numpy as np
 from vvgt_cli.commands.converter import ConsoleLine, Converted, Failed, Job, Message, Progress, Scored, Setup
 from vvgt_cli.commands.live_site import ServedCloud, page_files, stored
 from vvgt_cli.conversion.convert import convert
-from vvgt_cli.conversion.file_layout import ply_options
-from vvgt_cli.conversion.opened import open_field
+from vvgt_cli.conversion.opened import open_field, ply_options
 from vvgt_cli.conversion.previous_look import PreviousLook
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.conversion.result import Conversion
@@ -29,8 +28,7 @@ from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians, as_ply
 from vvgt_cli.gaussians.formats import ready
-from vvgt_cli.look.labels import LabelTable
-from vvgt_cli.look.lighting import Lighting
+from vvgt_cli.look import LabelTable, Lighting
 from vvgt_cli.progress import Console, ProgressCallback
 from vvgt_cli.resources import set_memory
 from vvgt_cli.score.record import ConversionReport, Run
@@ -199,9 +197,9 @@ def _note(send: Callable[[Message], None]) -> Callable[..., None]:
 
 def _plain(error: VvgtError) -> VvgtError:
     """Return an error with its line and exit status alone, which can be pickled."""
-    found = VvgtError(str(error))
-    found.exit_code = error.exit_code
-    return found
+    plain = VvgtError(str(error))
+    plain.exit_code = error.exit_code
+    return plain
 
 
 def _send(stream: IO[bytes], folder: str, message: tuple[int, Message]) -> None:

@@ -265,9 +265,9 @@ def _look_around(
         stage.note = f"worst: {conditions[0].name()}, {conditions[0].psnr:.2f} dB"
     near = [Picture(camera, settings) for camera in near_cameras(size)]
     with run.stage("texture") as stage, _together(volume, near):
-        found = score_texture(volume.views, gaussians, size, rule, settings, progress=run.console.bar("texture"))
-        evaluation.texture = asdict(found)
-        stage.note = texture_note(found)
+        scores = score_texture(volume.views, gaussians, size, rule, settings, progress=run.console.bar("texture"))
+        evaluation.texture = asdict(scores)
+        stage.note = texture_note(scores)
 
 
 def _reference_psnr(volume: Field, size: int, step: float) -> float:

@@ -44,7 +44,7 @@ def infer(
         UsageError: an output that may not be written, or an unknown model or provider.
         DataError: Gaussians, views or a model that are not valid.
     """
-    from vvgt_cli.library.outputs import written
+    from vvgt_cli.library.inputs import written
 
     name = os.fspath(ply)
     make = partial(_improved, name, os.fspath(views), model, provider)

@@ -21,14 +21,13 @@ from vvgt_cli.device import describe as describe_gpu
 from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, SeveralSteps, UsageError, VvgtError
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians import as_ply, describe, read_ply
-from vvgt_cli.gaussians.formats import format_of, is_splats, read_splats
+from vvgt_cli.gaussians.formats import format_of, is_page, is_splats, read_splats
 from vvgt_cli.gaussians.formats.levels import split_name
 from vvgt_cli.gaussians.formats.page_file import policy
 from vvgt_cli.gaussians.formats.page_values import ELEMENT
 from vvgt_cli.gaussians.formats.streamed import facts_of
-from vvgt_cli.look.function import PER_VOXEL
+from vvgt_cli.look import PER_VOXEL, Label
 from vvgt_cli.look.label_files import is_table, labels_of, read_labels
-from vvgt_cli.look.labels import Label
 from vvgt_cli.look.readers import OWN, SUFFIXES
 from vvgt_cli.look.readers.names import names
 from vvgt_cli.resources import free_memory, processors
@@ -91,7 +90,7 @@ def inspect(file: str, read: ReadOptions, function: FunctionRequest | None = Non
         if known is None:
             return facts
         size = path.stat().st_size
-        more = {"policy": policy(path.read_text("utf-8"))} if known.suffix == ".html" else {}
+        more = {"policy": policy(path.read_text("utf-8"))} if is_page(file) else {}
         stated = {"bytes": size, "bytes_per_gaussian": round(size / len(gaussians), 1), "format": known.suffix}
         return facts | stated | more
     if is_index(name):
@@ -116,9 +115,9 @@ def inspect(file: str, read: ReadOptions, function: FunctionRequest | None = Non
 def _shown(file: str, function: FunctionRequest) -> dict[str, Any]:
     gaussians, header = open_gaussians(file)
     tf, options = resolve_look(file, header, function)
-    found = apply_function(gaussians, header, tf, options)
-    written = read_ply(io.BytesIO(as_ply(found, options)))
-    return {"function": tf.name, "hidden": len(gaussians) - len(found), **describe(*written)}
+    visible = apply_function(gaussians, header, tf, options)
+    written = read_ply(io.BytesIO(as_ply(visible, options)))
+    return {"function": tf.name, "hidden": len(gaussians) - len(visible), **describe(*written)}
 
 
 def _head_of_stdin() -> bytes:
@@ -320,7 +319,7 @@ def what_leaves(file: str) -> dict[str, Any]:
         )
     _, header = read_splats(file)
     layers = () if header.live is None else header.live.layers
-    page = Path(file).suffix.lower() == ".html"
+    page = is_page(file)
     text = Path(file).read_text("utf-8") if page else ""
     scene = json.loads(_SCENE.findall(text)[0]) if page else {}
     held = f'id="{ELEMENT}-0"' in text and "of the volume, also of what its look hides"
@@ -328,7 +327,7 @@ def what_leaves(file: str) -> dict[str, Any]:
     legend = json.loads(header.legend or "{}")
     scanned = header.space in ("RAS", "LPS")
     made, facts = header.certificate, dict[str, Any](kind="sharing", name=Path(file).name)
-    found = {
+    details = {
         "title": header.title, "function": header.function,
         "command": made and made.command, "checksum": made and made.sha256,
         "range": legend.get("values"), "names": [*filter(None, names), *(name for name, _ in legend.get("labels", ()))],
@@ -339,7 +338,7 @@ def what_leaves(file: str) -> dict[str, Any]:
         "values": held or (layers and "data values under each Gaussian, and their histogram"),
         "other": [line for line in header.comments if not line.startswith(OURS)],
     }  # fmt: skip
-    facts |= {key: value for key, value in found.items() if value}
+    facts |= {key: value for key, value in details.items() if value}
     facts["picture"] = FACE + LATER * bool(held or layers)
     remove = "--no-comments omits all but the picture and the values, --title names it otherwise"
     return facts | {"remove": f"{remove}; positions of --frame world stay"}

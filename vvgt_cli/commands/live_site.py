@@ -27,10 +27,8 @@ from vvgt_cli.gaussians.formats.page_look import look_entry, parse_light
 from vvgt_cli.gaussians.formats.page_values import Values
 from vvgt_cli.gaussians.formats.splats import columns_of
 from vvgt_cli.gaussians.live_facts import MAX_LABELS, LiveFacts, function_text
-from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look import Label, LabelTable, Lighting, LightOptions, TransferFunction, check_labels
 from vvgt_cli.look.label_files import table_of
-from vvgt_cli.look.labels import Label, LabelTable, check_labels
-from vvgt_cli.look.lighting import Lighting, LightOptions
 from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.progress import Console
 from vvgt_cli.volume.readers import volume_name
@@ -144,8 +142,8 @@ def page_files(cloud: ServedCloud, values: Values | None) -> dict[str, bytes]:
 def corners(look: Mapping[str, Any]) -> list[list[float]]:
     """Return the corners of the volume's box in the viewer's axes."""
     ends = np.array(list(product(*np.transpose(look["box"]))))
-    found: list[list[float]] = (ends @ np.array(look["axes"])).round(3).tolist()
-    return found
+    places: list[list[float]] = (ends @ np.array(look["axes"])).round(3).tolist()
+    return places
 
 
 class PageController:
@@ -317,5 +315,5 @@ def plain_name(path: str) -> str:
     """Return a file's name to save under: letters, digits, dot, underscore, blank and dash."""
     known = max((suffix for suffix in SUFFIXES if path.lower().endswith(suffix)), key=len, default="")
     name = volume_name(Path(path.removeprefix("example:")[: len(path) - len(known)]))
-    found = re.sub(r"[^0-9A-Za-z._ -]+", "-", name).strip("-. ")
-    return found or "volume"
+    plain = re.sub(r"[^0-9A-Za-z._ -]+", "-", name).strip("-. ")
+    return plain or "volume"

@@ -62,8 +62,7 @@ def optimize(
         UsageError: both of steps and time_budget, or neither; an output that may not be written.
     """
     from vvgt_cli.gaussians.outputs import Output, check_outputs
-    from vvgt_cli.library.inputs import ply_of
-    from vvgt_cli.library.outputs import written
+    from vvgt_cli.library.inputs import ply_of, written
     from vvgt_cli.refine import OptimizeOptions
 
     if max_gaussians is not None and method != "3dgs":

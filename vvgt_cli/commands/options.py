@@ -9,7 +9,7 @@ import sys
 import warnings
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -18,9 +18,6 @@ from vvgt_cli.commands.words import SectionedCommand
 from vvgt_cli.defaults import INIT, MAX_GAUSSIANS, SIZE
 from vvgt_cli.progress import Console
 from vvgt_cli.resources import parse_size, processors, set_memory
-
-if TYPE_CHECKING:
-    from vvgt_cli.field.settings import BlockOptions
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 THREAD_VARIABLES = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "SLURM_CPUS_PER_TASK")
@@ -213,9 +210,9 @@ class Measure(click.ParamType[float]):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         """Return the number, or raise click.BadParameter."""
-        found, number = re.fullmatch(r"\s*([-+.\de]*[.\d])\s*([a-z]*)\s*", str(value).lower()), 0.0
+        parts, number = re.fullmatch(r"\s*([-+.\de]*[.\d])\s*([a-z]*)\s*", str(value).lower()), 0.0
         with suppress(ValueError, TypeError, KeyError):
-            number = float(found[1]) * self.units[found[2]]  # type: ignore[index]  # None: TypeError
+            number = float(parts[1]) * self.units[parts[2]]  # type: ignore[index]  # None: TypeError
         if not number > 0:
             units = ", ".join(filter(None, self.units))
             self.fail(f"{value!r} is not a {self.name}; expected a number above 0, with {units} or no unit")
@@ -359,16 +356,6 @@ block_options = group("blocks", **_options)
 shared_block_options = group("blocks", **_options, **_shard_option)
 
 
-def block_options_of(blocks: dict[str, Any]) -> BlockOptions | None:
-    """Return the options of blocks, None to let the program choose; raise UsageError if they do not fit together."""
-    from vvgt_cli.field.settings import BlockOptions
-
-    if all(value is None for value in blocks.values()):
-        return None
-    size = blocks.pop("block_size")
-    return BlockOptions(**{**blocks, "size": None if size == "auto" else size})
-
-
 def arguments(
     console: Console | None = None, optics: dict[str, Any] | None = None, light: dict[str, Any] | None = None,
     blocks: dict[str, Any] | None = None, read: Mapping[str, Any] = {}, **options: Any,
@@ -383,8 +370,11 @@ def arguments(
         several = (optics["tf"] or [None]) if isinstance(optics["tf"], tuple) else [optics["tf"]]
         looks = [Look(**optics | {"tf": tf}, light=light) for tf in several]
         options["look"] = looks if len(looks) > 1 else looks[0]
-    if blocks is not None:
-        options["blocks"] = block_options_of(blocks)
+    if blocks is not None and set(blocks.values()) != {None}:
+        from vvgt_cli.field.settings import BlockOptions
+
+        size = blocks.pop("block_size")
+        options["blocks"] = BlockOptions(None if size == "auto" else size, **blocks)
     return {**options, **read, **({} if console is None else {"progress": console})}
 
 

@@ -281,11 +281,11 @@ def _volume(
     """Return the ray caster of a volume, in memory or in blocks, and its name; ``stack`` closes the blocks."""
     from vvgt_cli.dvr import RenderSettings, render_view
 
-    settings, options, found = RenderSettings(), request.blocks or automatic(asked, run.console), None
+    settings, options, field = RenderSettings(), request.blocks or automatic(asked, run.console), None
     if options is not None:
         needs = FieldNeeds(1, cameras[0].height, values=request.rule == XRAY)
-        found = stack.enter_context(blocked(run, asked, options, stack.enter_context(store_beside(None)), needs))
-        source = found.source
+        field = stack.enter_context(blocked(run, asked, options, stack.enter_context(store_beside(None)), needs))
+        source = field.source
     else:
         with run.stage("read") as stage:
             source = load(asked)
@@ -293,17 +293,17 @@ def _volume(
     if source.volume.sheared:  # no pinhole camera sees it
         text = shear_text(source.volume.axes)
         raise DataError(f"{source.volume.name}: {text}; expected right angles: 'vvgt convert' accepts it")
-    where = " in blocks" if found else ""
+    where = " in blocks" if field else ""
     if request.rule == MIP:
         run.compile(GREATEST, source.kernel_type())
-        return render_in_box(mip_of(found or source), source.volume.axes), f"MIP{where}"
+        return render_in_box(mip_of(field or source), source.volume.axes), f"MIP{where}"
     if request.rule == XRAY:
         source = as_xray(source)
-        found = found and found.with_look(source)
+        field = field and field.with_look(source)
     kernels = source.kernels(RAYCAST)
-    run.compile(for_blocks(kernels) if found else kernels, source.kernel_type())
-    if found:
-        draw = draw_in_blocks(found, settings, cameras)
+    run.compile(for_blocks(kernels) if field else kernels, source.kernel_type())
+    if field:
+        draw = draw_in_blocks(field, settings, cameras)
     else:
         scene = source.scene()
         draw = render_in_box(lambda camera: render_view(scene, camera, settings), source.volume.axes)

@@ -52,8 +52,7 @@ def recolor(
     from vvgt_cli.conversion.recolored import FunctionRequest, apply_function, layer_look, resolve_look
     from vvgt_cli.conversion.result import Result
     from vvgt_cli.gaussians.formats import SUFFIXES
-    from vvgt_cli.library.inputs import Look, live_look
-    from vvgt_cli.library.outputs import written
+    from vvgt_cli.library.inputs import Look, live_look, written
 
     name, listed = os.fspath(ply), () if isinstance(layers, Mapping) else layers
     look = live_look(Look(tf, tf_range, opacity_unit_distance, light, labels, listed, iso)) or FunctionRequest()
@@ -66,9 +65,9 @@ def recolor(
             own = layers.items() if isinstance(layers, Mapping) else ()
             named = tuple(layer_look(header, key, one) for key, one in own)
             shown, options = resolve_look(name, header, replace(look, layers=look.layers + named))
-            found = apply_function(gaussians, header, shown, options)
-            stage.note = f"{len(found)} of them visible under {shown.name}"
-        return Result(found, run.report, options)
+            visible = apply_function(gaussians, header, shown, options)
+            stage.note = f"{len(visible)} of them visible under {shown.name}"
+        return Result(visible, run.report, options)
 
     inputs = [name, *look.paths()]
     return written(make, "recolor", inputs, output, overwrite=overwrite, progress=progress, suffixes=SUFFIXES)

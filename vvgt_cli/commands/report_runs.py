@@ -118,24 +118,24 @@ def plan_runs(options: RunOptions) -> list[PlannedRun]:
     """List the runs: other trainers first, as they may fail; then ours from the cheapest on; then the baselines."""
     most, size, seed = options.max_gaussians, options.screen, options.seed
     budgets = sorted({max(most // share, 1) for share in SHARES} | {most})
-    found = [
+    runs = [
         PlannedRun(f"closed form, K = {short(k)}", short(k), "closed form", FitOptions(k, size, seed=seed, steps=0))
         for k in budgets
     ]
     if options.live:
-        found.append(PlannedRun(f"live form, K = {short(most)}", "live", "live", FitOptions(most, size, seed=seed)))
+        runs.append(PlannedRun(f"live form, K = {short(most)}", "live", "live", FitOptions(most, size, seed=seed)))
     if options.model:
         fit = FitOptions(most, size, seed=seed, steps=0, model=options.model)
-        found.append(PlannedRun(f"network {Path(options.model).name}", "network", "network", fit))
+        runs.append(PlannedRun(f"network {Path(options.model).name}", "network", "network", fit))
     for steps in sorted(set(options.steps)):
         fit = FitOptions(most, size, seed=seed, steps=steps)
-        found.append(PlannedRun(f"{steps} steps", f"{steps} steps", "steps", fit))
+        runs.append(PlannedRun(f"{steps} steps", f"{steps} steps", "steps", fit))
     most_steps = max(options.steps, default=0)
     longest = FitOptions(most, size, seed=seed, steps=most_steps)
     if most_steps:
         for name, start in (("3DGS", "points"), ("iVR-GS setting", "samples")):
-            found.append(PlannedRun(f"{name}, {most_steps} steps", name, "baseline", longest, start))
-    return [PlannedRun(peer.name, peer.name, "peer", longest, peer=peer) for peer in options.peers] + found
+            runs.append(PlannedRun(f"{name}, {most_steps} steps", name, "baseline", longest, start))
+    return [PlannedRun(peer.name, peer.name, "peer", longest, peer=peer) for peer in options.peers] + runs
 
 
 @dataclass(frozen=True)
@@ -191,10 +191,10 @@ class Reference:
         try:
             with quiet_vtk():  # which says where it looked for a screen
                 draw = view_renderer(renderer, field.scene)
-                found = [score_view(self.images[i], draw(self.cameras[i]), perceptual=False).psnr for i in WHOLE]
+                scores = [score_view(self.images[i], draw(self.cameras[i]), perceptual=False).psnr for i in WHOLE]
         except (DataError, UsageError):
             return None
-        return float(np.mean(found))
+        return float(np.mean(scores))
 
     def score(self, gaussians: Gaussians) -> tuple[Scores, list[np.ndarray]]:
         """Return scores as `vvgt evaluate` measures them, and the images of the Gaussians."""
@@ -352,14 +352,14 @@ def random_points(half: np.ndarray, count: int, seed: int) -> Gaussians:
 
 def pictures(images: Sequence[np.ndarray] | np.ndarray, numbers: Sequence[int], limit: int) -> list[np.ndarray]:
     """Return RGB over black of some views, (h, w, 3) in [0, 1], averaged down to sides of at most ``limit``."""
-    found = []
+    shown = []
     for n in numbers:
         image = np.clip(images[n][..., :3], 0, 1)
         factor = -(-max(image.shape[:2]) // limit)
         height, width = (side // factor for side in image.shape[:2])
         squares = image[: height * factor, : width * factor].reshape(height, factor, width, factor, 3)
-        found.append(squares.mean(axis=(1, 3)))
-    return found
+        shown.append(squares.mean(axis=(1, 3)))
+    return shown
 
 
 PAGE, TABLE, DATA = "report.html", "report.csv", "report.json"
@@ -412,15 +412,15 @@ def report_on(
         "vtk_psnr": ceiling,
     }
     text = document("vvgt-report", content)
-    found: dict[str, Any] = json.loads(text)
-    series = [ReportRuns(scene.volume.name, runs, found)]
+    report: dict[str, Any] = json.loads(text)
+    series = [ReportRuns(scene.volume.name, runs, report)]
     shown = list(map(png_bytes, pictures(reference.shown, PICTURED, picture_size)))
     folder.mkdir(exist_ok=True)
     write_text(str(folder / DATA), text, overwrite)
     title = f"Error against run time: {scene.volume.name}"
     _write(folder, series, title, Pictures(list(PICTURED), shown, ours), overwrite)
     console.message(f"{folder / PAGE}")
-    return found
+    return report
 
 
 def _with_model(options: RunOptions) -> RunOptions:
@@ -461,12 +461,12 @@ def compare(paths: Sequence[str], output: str, overwrite: bool, console: Console
 
 def _distinct(series: list[ReportRuns]) -> list[ReportRuns]:
     """Add numbers to reports that share a name, and put the report's name before those of its runs."""
-    names, found = [one.name for one in series], []
+    names, renamed = [one.name for one in series], []
     for n, one in enumerate(series):
         name = one.name if names.count(one.name) == 1 else f"{one.name} ({n + 1})"
         runs = [{"label": run["name"], **run, "name": f"{name}: {run['name']}"} for run in one.runs]
-        found.append(ReportRuns(name, runs, one.document))
-    return found
+        renamed.append(ReportRuns(name, runs, one.document))
+    return renamed
 
 
 def _folder(output: str, names: Sequence[str], overwrite: bool, inputs: Sequence[str] = ()) -> Path:

@@ -77,10 +77,9 @@ def convert(tf: str, output: str, form: str, tf_range: str, overwrite: bool, con
       vvgt tf convert plasma.itf plasma.json --tf-range 0,255 --format paraview
     """
     from vvgt_cli.gaussians.outputs import Output, check_outputs, write_text
-    from vvgt_cli.look import read_transfer_function
-    from vvgt_cli.look.convert import placed, to_text
-    from vvgt_cli.look.function import PER_VOXEL
-    from vvgt_cli.look.resolve import parse_tf_range
+    from vvgt_cli.look import PER_VOXEL, read_transfer_function
+    from vvgt_cli.look.resolve import parse_tf_range, placed
+    from vvgt_cli.look.to_json import to_text
 
     check_outputs([Output("OUT", output, (".json",), binary=False)], [tf.partition("#")[0]], overwrite)
     limits = parse_tf_range(tf_range)
@@ -110,9 +109,9 @@ def list_named(console: Console) -> None:
     """
     from vvgt_cli.look.readers.names import names
 
-    found = names()
-    for name, shows in found.items():
-        click.echo(f"{name:<{max(map(len, found)) + 2}}{shows}")
+    known = names()
+    for name, shows in known.items():
+        click.echo(f"{name:<{max(map(len, known)) + 2}}{shows}")
 
 
 @command.command("suggest", short_help="Suggest functions that each show one range of values.")

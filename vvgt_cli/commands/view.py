@@ -34,7 +34,7 @@ def view(
         browser: open one, if there is a display.
         values: let a page of a volume hold its values, for slices and other looks.
         title: of the page; None: the file's own.
-        story: for the page to tell, a story.json or its content (docs/live.md).
+        story: for the page to tell, a story.json or its content (docs/page.md).
         overwrite: replace the output if it exists.
         progress: print messages on standard error.
         **reading: of a volume, as in `convert`.
@@ -45,8 +45,8 @@ def view(
         DataError: a file that is not valid.
     """
     from vvgt_cli.commands import viewer
-    from vvgt_cli.conversion.gaussian_files import is_page
     from vvgt_cli.conversion.index import named_files
+    from vvgt_cli.gaussians.formats import is_page
     from vvgt_cli.gaussians.story import read_story
     from vvgt_cli.library.inputs import console_of, source_of
     from vvgt_cli.score.record import ConversionReport, Run
@@ -55,7 +55,7 @@ def view(
         raise UsageError("-o writes a file and starts no server; omit --port and --no-browser")
     if output is None and not values:
         raise UsageError("--no-values is for a page that is saved; give -o OUT.html, or omit it")
-    if story is not None and not is_page(None if output is None else os.fspath(output)):
+    if story is not None and not is_page(output):
         raise UsageError("--story is for a page that is saved; give -o OUT.html, or omit it")
     told = None if story is None else read_story(story)
     names = [files] if isinstance(files, str | os.PathLike) else files

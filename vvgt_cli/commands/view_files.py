@@ -154,10 +154,10 @@ def field_points(field: Field, size: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the `start_points` of a volume in blocks."""
     from vvgt_cli.closed_form import VbmOptions
 
-    found = field.pyramid(VbmOptions(POINTS, size)).gaussians
+    gaussians = field.pyramid(VbmOptions(POINTS, size)).gaussians
     half = np.array(field.source.volume.unit_frame().half)
-    points = np.clip(found.means.astype(np.float64), -half, half)
-    return points @ field.source.volume.axes.T, np.clip(found.colors, 0, 1)
+    points = np.clip(gaussians.means.astype(np.float64), -half, half)
+    return points @ field.source.volume.axes.T, np.clip(gaussians.colors, 0, 1)
 
 
 def _thinned(scene: Scene, every: np.ndarray) -> Scene:

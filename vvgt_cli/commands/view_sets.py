@@ -110,13 +110,13 @@ def folders_of(root: Path, names: Sequence[str]) -> list[Path]:
     check_folder(root, "views")
     if len(names) == 1:
         return [root]
-    found: dict[str, str] = {}
+    folders: dict[str, str] = {}
     for name in names:
         plain = re.sub(r"[^\w.-]+", "_", name).strip(".") or "function"
-        if plain in found:
-            raise UsageError(f"functions {found[plain]} and {name} would both go to {root / plain}; rename one")
-        found[plain] = name
-    return [root / plain for plain in found]
+        if plain in folders:
+            raise UsageError(f"functions {folders[plain]} and {name} would both go to {root / plain}; rename one")
+        folders[plain] = name
+    return [root / plain for plain in folders]
 
 
 @dataclass(frozen=True)
@@ -325,11 +325,11 @@ def _work(run: Run, one: _Set, rays: Rays) -> None:
         draw, points = prepare(run, one.source, one.blocks, rays, [view.camera for view in one.pending])
     if models and layout.points:
         with run.stage("points") as stage:
-            found = points(views[0].camera.height)
-            if not len(found[0]):
+            cloud = points(views[0].camera.height)
+            if not len(cloud[0]):
                 raise NothingVisible(one.source.volume.name, one.source.tf.name)
-            stage.note = f"{len(found[0])} points to start from"
-        built |= layout.models(views, *found)
+            stage.note = f"{len(cloud[0])} points to start from"
+        built |= layout.models(views, *cloud)
     elif models:
         built |= layout.models(views, NO_POINTS, NO_POINTS)
     for name in ("", *layout.folders(views)):

@@ -17,20 +17,12 @@ from typing import TYPE_CHECKING, Any
 from vvgt_cli.commands.converter import Converter
 from vvgt_cli.commands.live_site import BYTES, HTML, JSON, SCRIPT, PageController, ServedCloud, plain_name, stored
 from vvgt_cli.commands.server import Resource, Site, served
-from vvgt_cli.conversion.gaussian_files import (
-    STDIN,
-    is_page,
-    layout_of,
-    open_gaussians,
-    report_agreement,
-    write_gaussians,
-    write_page,
-)
+from vvgt_cli.conversion.gaussian_files import STDIN, layout_of, open_gaussians, read_back, write_gaussians, write_page
 from vvgt_cli.conversion.index import named_files
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians, PlyOptions
-from vvgt_cli.gaussians.formats import SUFFIXES, is_splats
+from vvgt_cli.gaussians.formats import SUFFIXES, is_page, is_splats
 from vvgt_cli.gaussians.formats.page_file import PROGRAM, VIEWER, asked, asset, camera, farthest, page
 from vvgt_cli.gaussians.formats.page_values import Values
 from vvgt_cli.gaussians.formats.sog import IMAGES, META
@@ -73,7 +65,7 @@ def save(
             gaussians, options, held = _opened(run, file, request)
             write_gaussians(run, output, gaussians, options, overwrite, values=held)
             run.compile(for_degree(DRAW, gaussians.degree))
-            report_agreement(run, output, gaussians, options)
+            read_back(run, output, gaussians, options)
 
 
 def show(

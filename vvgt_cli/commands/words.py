@@ -60,15 +60,15 @@ def expand(args: Sequence[str]) -> list[str]:
 
 def _numbers(words: list[str], count: int) -> tuple[int, list[str]]:
     """Return how many words hold ``count`` numbers, and the numbers; (0, []) if the words are something else."""
-    found: list[str] = []
+    numbers: list[str] = []
     for taken, word in enumerate(words[:_LONGEST], 1):
         parts = [part.strip() for part in _BETWEEN.split(word)]
         if not all(map(_is_number, filter(None, parts))):
             break
-        found += filter(None, parts)
-        if len(found) == count:
-            return taken, found
-        if len(found) > count:
+        numbers += filter(None, parts)
+        if len(numbers) == count:
+            return taken, numbers
+        if len(numbers) > count:
             break
     return 0, []
 

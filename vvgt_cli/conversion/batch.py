@@ -24,7 +24,7 @@ from vvgt_cli.look.labels import NO_LABELS
 from vvgt_cli.score.record import Run
 
 if TYPE_CHECKING:
-    from vvgt_cli.conversion.warm_start import WarmStart
+    from vvgt_cli.conversion.plan import WarmStart
 
 ONE, LIVE, LEVELS, ONE_FILE = "one volume", "--live", "streamed levels", "one file of several clouds"
 LAYERS, NODES = "labels of layers", "one file with a node for each function"

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera
-from vvgt_cli.cameras.blocks import BLOCK
+from vvgt_cli.cameras import BLOCK, Camera
 from vvgt_cli.dvr.layers import Layer
 from vvgt_cli.field.source import StyledVolume
 from vvgt_cli.gaussians import Gaussians
@@ -47,11 +46,11 @@ class Changes:
         low, high = np.clip(low, 0, most), np.clip(high, 0, most)
         sums = np.zeros(np.array(self.blocks.shape) + 1, np.int64)
         sums[1:, 1:, 1:] = self.blocks.cumsum(0).cumsum(1).cumsum(2)
-        found = np.zeros(len(gaussians), np.int64)
+        differing = np.zeros(len(gaussians), np.int64)
         for corner in range(8):
             x, y, z = (np.where(corner >> axis & 1, high[:, axis], low[:, axis]) for axis in range(3))
-            found += (1 if corner in (1, 2, 4, 7) else -1) * sums[z, y, x]
-        return found > 0
+            differing += (1 if corner in (1, 2, 4, 7) else -1) * sums[z, y, x]
+        return differing > 0
 
     def seen_by(self, camera: Camera) -> np.ndarray:
         """Return (rows, columns) bool, the blocks of pixels, from the upper left corner, that show a difference."""

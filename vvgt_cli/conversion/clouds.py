@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vvgt_cli.conversion.gaussian_files import is_page
 from vvgt_cli.conversion.index import (
     FRAMES,
     entry,
@@ -25,7 +24,7 @@ from vvgt_cli.conversion.index import (
 from vvgt_cli.conversion.result import Result
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
-from vvgt_cli.gaussians.formats import SUFFIXES, format_of
+from vvgt_cli.gaussians.formats import SUFFIXES, format_of, is_page
 from vvgt_cli.gaussians.formats.nodes import Node
 from vvgt_cli.gaussians.formats.splats import splats_of
 from vvgt_cli.gaussians.outputs import Output, check_outputs
@@ -157,15 +156,15 @@ class Clouds(Mapping[str, Result]):
             **how: frame, up and comments; see `Result.save`.
         """
         degree = max(cloud.gaussians.degree for cloud in self.clouds)
-        found = []
+        nodes = []
         for cloud in self.clouds:
             ply = cloud.layout(sh_degree=sh_degree, **how)
             ply = replace(ply, live=None, sh_degree=degree if ply.sh_degree is None else ply.sh_degree)
             splats = splats_of(replace(cloud.gaussians, live=None), ply)
             facts = {key: value for key, value in cloud.facts.items() if key not in NOT_IN_NODES and ply.comments}
             place = tuple(cloud.facts.get("parents", ())), facts, cloud.facts.get("visible", True)
-            found.append(Node(cloud.name, splats, *place))
-        return found
+            nodes.append(Node(cloud.name, splats, *place))
+        return nodes
 
     def recolor(self, look: str | TransferFunction | None = None, **how: Any) -> Clouds:
         """Return all live clouds under another function: `Result.recolor` of each.
@@ -177,11 +176,11 @@ class Clouds(Mapping[str, Result]):
         Raises:
             DataError, UsageError: see `Result.recolor`.
         """
-        found = []
+        shown = []
         for cloud in self.clouds:
             other = cloud.recolor(look, **how)
-            found.append(replace(cloud, gaussians=other.gaussians, report=other.report, ply=other.ply, directions=None))
-        return replace(self, clouds=found)
+            shown.append(replace(cloud, gaussians=other.gaussians, report=other.report, ply=other.ply, directions=None))
+        return replace(self, clouds=shown)
 
     def _page(self, path: str, story: StoryLike | None, overwrite: bool, how: dict[str, Any]) -> int:
         """Write one page of all clouds."""

@@ -28,7 +28,6 @@ from vvgt_cli.conversion.clouds import Cloud, Clouds
 from vvgt_cli.conversion.convert import convert
 from vvgt_cli.conversion.fitting import plan_of
 from vvgt_cli.conversion.frames import FrameSeries, is_glob_of_volumes
-from vvgt_cli.conversion.gaussian_files import holds_several, is_page
 from vvgt_cli.conversion.index import (
     FRAMES,
     FUNCTIONS,
@@ -49,6 +48,7 @@ from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError
 from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.files import claim
+from vvgt_cli.gaussians.formats import format_of, is_page
 from vvgt_cli.gaussians.formats.page_look import contents
 from vvgt_cli.gaussians.formats.streamed import MANIFEST, folder_of, is_streamed
 from vvgt_cli.gaussians.outputs import Output, check_outputs, claimed
@@ -188,13 +188,13 @@ class Files:
                 known = len(manifest.files)
                 files = (self._key(self.names(batch, stem)[0]) for stem in batch.stems)
                 rows = [manifest.files[file]["row"] for file in files if file in manifest.files]
-            found = index_of(batch.kind, batch.volume, rows, **batch.facts)
-            write_index(path, found, self._request.overwrite or manifest is not None)
+            index = index_of(batch.kind, batch.volume, rows, **batch.facts)
+            write_index(path, index, self._request.overwrite or manifest is not None)
             if manifest is None:
                 break
             manifest.refresh()  # another shard may have recorded its last item meanwhile
         console.message(f"{path}: {len(rows)} {batch.kind}, {len(self._rows)} of them converted in this run")
-        return found
+        return index
 
 
 class Memory:
@@ -224,17 +224,17 @@ class Memory:
     def convert(self, batch: Batch, item: Item, console: Console) -> ConversionReport:
         """Convert an item, release its volume, and return the report."""
         alone = replace(item.request, output=None, report=None, preview=None)
-        found = convert(alone, console, start=batch.previous, finished=item.gaussians)
-        normals, own = found.normals(), found.field.source.volume.unit_frame()
-        gaussians, ply, self._first = found.gaussians, found.ply, self._first or (own, found.ply)
+        conversion = convert(alone, console, start=batch.previous, finished=item.gaussians)
+        normals, own = conversion.normals(), conversion.field.source.volume.unit_frame()
+        gaussians, ply, self._first = conversion.gaussians, conversion.ply, self._first or (own, conversion.ply)
         if own != self._first[0]:  # another layer's
             gaussians = to_frame_of(gaussians, own, self._first[0])
             ply = replace(ply, **{name: getattr(self._first[1], name) for name in PLACE})
         values = None
         if batch.kind == FRAMES and item.request.values:
-            values = found.field.source.values(share=len(batch.stems))
-        self._made = Cloud(gaussians, found.report, ply, item.name, item.stem, dict(item.facts), normals, values)
-        return found.report
+            values = conversion.field.source.values(share=len(batch.stems))
+        self._made = Cloud(gaussians, conversion.report, ply, item.name, item.stem, dict(item.facts), normals, values)
+        return conversion.report
 
     def take(self, batch: Batch, item: Item, report: ConversionReport, facts: Mapping[str, Any]) -> None:
         """Keep an item."""
@@ -307,7 +307,8 @@ def convert_all(
     kind = FUNCTIONS if several else LABELS if split_labels else FRAMES if numbered else ONE
     named = LAYERS if kind == LABELS and request.source.layers else kind
     kinds = [*([LEVELS] if is_streamed(output) else []), named, *([LIVE] if request.live else [])]
-    together = kind != ONE and holds_several(output) and not numbered
+    holds_several = is_page(output) or ((known := format_of(output)) is not None and known.write_nodes is not None)
+    together = kind != ONE and holds_several and not numbered
     nodes = together and kind == FUNCTIONS and not is_page(output)
     also = {NO_PAGE: not is_page(output), ONE_FILE: together, NODES: nodes}
     for one in [*kinds, *(one for one, so in also.items() if so)]:
@@ -337,8 +338,8 @@ def convert_all(
     batch = FrameSeries(request, share) if kind == FRAMES else Labels(request) if kind == LABELS else Functions(looks)
     if together:
         return _save_one_file(batch, request, output, console)
-    found = _run(batch, Files(request, share) if output else Memory(), console)
-    return None if output else found
+    result = _run(batch, Files(request, share) if output else Memory(), console)
+    return None if output else result
 
 
 def _save_one_file(batch: Batch, request: ConvertRequest, output: str, console: Console) -> Clouds:

@@ -268,15 +268,15 @@ class CutPlan:
         """Read the plan beside blocks; raise DataError if it is missing or damaged."""
         path = store.folder / PLAN
         try:
-            found = json.loads(path.read_text("utf-8"))
-            grid, ply = found["grid"], found["ply"]
+            content = json.loads(path.read_text("utf-8"))
+            grid, ply = content["grid"], content["ply"]
             boxes = Boxes(*(tuple(grid["blocks"][key]) for key in ("dims", "edge")))
             grid = CellGrid(**{**{key: _tupled(value) for key, value in grid.items()}, "blocks": boxes})
             options = PlyOptions(**{key: _tupled(value) for key, value in ply.items()})
             if options.light is not None:
                 light = {key: _tupled(value) for key, value in ply["light"].items()}
                 options = replace(options, light=Lighting(**light))
-            return replace(cls(**{**found, "grid": grid, "ply": options}), axes=tuple(found["axes"]))
+            return replace(cls(**{**content, "grid": grid, "ply": options}), axes=tuple(content["axes"]))
         except FileNotFoundError:
             raise DataError(
                 f"{path}: missing, since not all shards have counted their blocks; run the same array again"
@@ -291,8 +291,8 @@ def load_light(store: BlockStore, plan: CutPlan) -> Light | None:
         return None
     path = store.folder / LIGHT
     try:
-        with np.load(path) as found:
-            return Light(**{key: found[key] if found[key].ndim else found[key].item() for key in Light._fields})
+        with np.load(path) as arrays:
+            return Light(**{key: arrays[key] if arrays[key].ndim else arrays[key].item() for key in Light._fields})
     except (OSError, ValueError, KeyError) as error:
         raise DataError(f"{path}: damaged ({error}); remove {PLAN} beside it and run a shard again") from error
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from vvgt_cli.conversion.file_layout import degree_of, ply_options
 from vvgt_cli.conversion.live import LiveForm, LiveLook, check_live
-from vvgt_cli.conversion.opened import open_field
+from vvgt_cli.conversion.opened import degree_of, open_field, ply_options
 from vvgt_cli.conversion.place import headset_axes
-from vvgt_cli.conversion.plan import Plan, Planner, check_memory, report_target
+from vvgt_cli.conversion.plan import Plan, Planner, WarmStart, check_memory, report_target
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions, file_bytes
 from vvgt_cli.conversion.resume import FITTED, checkpoint_of
 from vvgt_cli.conversion.stage import Stage, Work
@@ -17,7 +16,6 @@ from vvgt_cli.conversion.stages import CheckViews, ClosedFormStage, TestViews, V
 from vvgt_cli.conversion.stages.parts import OutOfCore, StoredViews
 from vvgt_cli.conversion.stages.refinement import most_steps
 from vvgt_cli.conversion.stages.views import suits_small_views
-from vvgt_cli.conversion.warm_start import WarmStart
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.blocked import Blocked
 from vvgt_cli.field.field import Field, Picture

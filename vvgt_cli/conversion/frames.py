@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vvgt_cli.conversion.batch import Batch, Item
-from vvgt_cli.conversion.gaussian_files import is_page
 from vvgt_cli.conversion.index import FRAMES, frame_facts, index_path
 from vvgt_cli.conversion.manifest import Shard
 from vvgt_cli.conversion.place import up_axis
@@ -22,6 +21,7 @@ from vvgt_cli.field.layered import ALL, OpenedFile, functions_of, open_content
 from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.files import read_text
+from vvgt_cli.gaussians.formats import is_page
 from vvgt_cli.look.label_files import table_for
 from vvgt_cli.look.labels import AUTO, NO_LABELS, LabelTable
 from vvgt_cli.network.card import CARD, find_model
@@ -134,24 +134,24 @@ class FrameSeries(Batch):
             request = replace(request, blocks=automatic(self.sources()[0], console))
         source = request.source
         with run.stage("frames") as stage:
-            found = survey(steps, source.labels, source.tf, console, request.blocks is not None)
-            source = replace(source, statistics=found.whole)
-            if found.first.components_message:  # reported once, not for every frame
+            surveyed = survey(steps, source.labels, source.tf, console, request.blocks is not None)
+            source = replace(source, statistics=surveyed.whole)
+            if surveyed.first.components_message:  # reported once, not for every frame
                 steps = [replace(step, read=replace(step.read, component=ALL)) for step in steps]
-            if source.labels is None and found.labels is not None:
+            if source.labels is None and surveyed.labels is not None:
                 source = replace(source, labels=AUTO)
-            shown, distance = _functions(source, found)
-            self._dark = [not source.layers and _invisible(shown, ranges) for ranges in found.ranges]
-            lo, hi = min(n.lo for n in found.whole), max(n.hi for n in found.whole)
+            shown, distance = _functions(source, surveyed)
+            self._dark = [not source.layers and _invisible(shown, ranges) for ranges in surveyed.ranges]
+            lo, hi = min(n.lo for n in surveyed.whole), max(n.hi for n in surveyed.whole)
             stage.note = (
-                f"{len(steps)} of {' x '.join(map(str, found.grid.dims))}, values {lo:g} to {hi:g}; "
+                f"{len(steps)} of {' x '.join(map(str, surveyed.grid.dims))}, values {lo:g} to {hi:g}; "
                 f"{' + '.join(tf.name for tf in shown)}: opacity per {distance[0]:g} ({distance[1]})"
             )
         if all(self._dark):
             raise DataError(
                 f"{source.volume}: {shown[0].name} shows nothing in any of {len(steps)} frames; try another function"
             )
-        self._steps, self._survey, self._shown, self._distance = steps, found, shown, distance[0]
+        self._steps, self._survey, self._shown, self._distance = steps, surveyed, shown, distance[0]
         self.request = replace(request, source=source)
         self.facts = {"empty": [k for k, dark in enumerate(self._dark) if dark]}
 
@@ -195,6 +195,8 @@ class FrameSeries(Batch):
             "opacity_unit_distance": self._distance,
             **({} if lighting is None else {"light": lighting.text()}),
             **({"live": True} if request.live else {}),
+            "title": request.title,
+            "values": request.values,
             **({"story": list(request.story.steps)} if request.story else {}),
             **asdict(request.fit),
             **asdict(request.limits),
@@ -232,7 +234,7 @@ def survey(
     """
     first: OpenedFile | None = None
     stats, digests = [], []
-    mapped, found = labels not in (None, NO_LABELS), set[int]()
+    mapped, present = labels not in (None, NO_LABELS), set[int]()
     bar = console.bar("range")
     for k, step in enumerate(steps):
         content = open_content(step.volume, replace(step.read, stored=True, packed=True) if stored else step.read)
@@ -243,7 +245,7 @@ def survey(
         if k == 0 and labels is None and tf is None and content.single_volume:
             mapped = recognised(content.volumes[0])
         if mapped and content.single_volume:
-            found.update(labels_in(content.volumes[0]))
+            present.update(labels_in(content.volumes[0]))
         stats.append([statistics(volume) for volume in content.classified])
         digests += [volume_digest(volume) for volume in content.volumes]
         if bar:
@@ -252,7 +254,7 @@ def survey(
         raise UsageError("the series has no frames; expected one or more")
     whole = tuple(merge_statistics(rows) for rows in zip(*stats, strict=True))
     own = [[(n.lo, n.hi) for n in rows] for rows in stats]
-    return Survey(len(steps), own, whole, first, digest(*digests), tuple(sorted(found)) if mapped else None)
+    return Survey(len(steps), own, whole, first, digest(*digests), tuple(sorted(present)) if mapped else None)
 
 
 def _without_values(volume: Volume) -> Volume:

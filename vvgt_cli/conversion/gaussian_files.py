@@ -16,15 +16,13 @@ from typing import IO, TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera, default_views
-from vvgt_cli.cameras.blocks import spread_blocks
-from vvgt_cli.cameras.sets import SIZE
+from vvgt_cli.cameras import SIZE, Camera, default_views, spread_blocks
 from vvgt_cli.conversion.place import to_box_frame
 from vvgt_cli.conversion.request import HARMONIC_BYTES, VERTEX_BYTES
 from vvgt_cli.errors import DataError, VvgtError
 from vvgt_cli.files import atomic_write, check_disk_space, is_stream
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, in_unit_frame, read_ply, write_ply
-from vvgt_cli.gaussians.formats import encoded, format_of, read_splats
+from vvgt_cli.gaussians.formats import encoded, format_of, is_page, read_splats
 from vvgt_cli.gaussians.formats.levels import StreamedLevels
 from vvgt_cli.gaussians.formats.page_look import contents, page_of_several
 from vvgt_cli.gaussians.formats.page_values import Values
@@ -40,8 +38,7 @@ from vvgt_cli.score.views import score_test_views
 
 if TYPE_CHECKING:
     from vvgt_cli.conversion.stored import FinishedParts
-    from vvgt_cli.dvr import Scene
-    from vvgt_cli.dvr.render import Viewed
+    from vvgt_cli.field.field import Field
     from vvgt_cli.volume import Volume
 
 
@@ -172,18 +169,6 @@ def _sink(output: str, overwrite: bool) -> Iterator[IO[bytes]]:
         yield sink
 
 
-def is_page(output: str | None) -> bool:
-    """Return whether an output is a page, which can hold several clouds."""
-    known = None if output in (None, STDOUT) else format_of(str(output))
-    return known is not None and known.suffix == ".html"
-
-
-def holds_several(output: str) -> bool:
-    """Return whether an output can hold several clouds: a page, or a format with nodes."""
-    known = None if output == STDOUT else format_of(output)
-    return is_page(output) or (known is not None and known.write_nodes is not None)
-
-
 def write_page(
     run: Run, output: str, clouds: Sequence[tuple[str, str]], overwrite: bool, story: Story | None = None
 ) -> None:  # fmt: skip
@@ -255,7 +240,9 @@ def _rescue(output: Path, gaussians: Gaussians, options: PlyOptions, normals: np
     return None
 
 
-def report_agreement(run: Run, output: str, gaussians: Gaussians, options: PlyOptions) -> None:
+def read_back(
+    run: Run, output: str, gaussians: Gaussians, options: PlyOptions, field: Field | None = None
+) -> None:  # fmt: skip
     """Report how close pictures of a written file are to those of the Gaussians, unless it is a `.ply`.
 
     Args:
@@ -263,47 +250,31 @@ def report_agreement(run: Run, output: str, gaussians: Gaussians, options: PlyOp
         output: the written file.
         gaussians: Gaussians before writing, unit frame.
         options: layout of the file.
+        field: their volume; the loss of PSNR against its pictures is reported instead.
     """
+    from vvgt_cli.dvr import RenderSettings
     from vvgt_cli.images.metrics import psnr
     from vvgt_cli.splat import render
 
     if format_of(output) is None:
         return
     with run.stage("read back") as stage:
-        back = in_unit_frame(*read_splats(output))
-        size, rule = options.screen_size or SIZE, rule_of(options.rule or INRIA)
-        cameras, found = default_views("test", size=size), []
+        clouds, size = (gaussians, in_unit_frame(*read_splats(output))), options.screen_size or SIZE
+        rule, scores = rule_of(options.rule or INRIA), []
+        if field is not None:
+            before, after = (
+                score_test_views(
+                    field.views, to_box_frame(cloud, field.source.volume), size, RenderSettings(), rule=rule,
+                    perceptual=False, only=PREVIEW_VIEWS,
+                ).psnr
+                for cloud in clouds
+            )  # fmt: skip
+            stage.note = (
+                f"PSNR {after:.2f} dB, a .ply would have {before:.2f}: the format costs {before - after:.2f} dB"
+            )
+            return
         for i in PREVIEW_VIEWS:
-            blocks = spread_blocks(size, size, i)
-            both = [render(g, cameras[i], rule, blocks=blocks)[..., :3] for g in (gaussians, back)]
-            before, after = (np.clip(image if blocks is None else blocks.pick(image), 0, 1) for image in both)
-            found.append(psnr(before, after))
-        stage.note = f"{np.mean(found):.2f} dB from the Gaussians before writing, {len(found)} views of {size} px"
-
-
-def report_format_cost(
-    run: Run, output: str, gaussians: Gaussians, options: PlyOptions, scene: Scene | Viewed, volume: Volume
-) -> None:
-    """Report how much PSNR against the volume a written file has lost by its format, unless it is a `.ply`.
-
-    Args:
-        run: gets a stage.
-        output: the written file.
-        gaussians: Gaussians before writing, unit frame.
-        options: layout of the file.
-        scene: scene of the volume.
-        volume: volume of the Gaussians.
-    """
-    from vvgt_cli.dvr import RenderSettings
-
-    if format_of(output) is None:
-        return
-    with run.stage("read back") as stage:
-        size, rule = options.screen_size or SIZE, options.rule or INRIA
-        before, after = (
-            score_test_views(
-                scene, to_box_frame(g, volume), size, RenderSettings(), rule=rule, perceptual=False, only=PREVIEW_VIEWS
-            ).psnr
-            for g in (gaussians, in_unit_frame(*read_splats(output)))
-        )
-        stage.note = f"PSNR {after:.2f} dB, a .ply would have {before:.2f}: the format costs {before - after:.2f} dB"
+            camera, blocks = default_views("test", size=size)[i], spread_blocks(size, size, i)
+            both = [render(cloud, camera, rule, blocks=blocks)[..., :3] for cloud in clouds]
+            scores.append(psnr(*(np.clip(image if blocks is None else blocks.pick(image), 0, 1) for image in both)))
+        stage.note = f"{np.mean(scores):.2f} dB from the Gaussians before writing, {len(scores)} views of {size} px"

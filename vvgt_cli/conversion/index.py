@@ -128,10 +128,10 @@ def psnr_of(report: ConversionReport) -> float | None:
 
 def index_of(kind: str, volume: str, files: Sequence[dict[str, Any]], **facts: Any) -> dict[str, Any]:
     """Return the document of an index; the paths of ``files`` are relative to it."""
-    found: dict[str, Any] = plain(
+    document: dict[str, Any] = plain(
         {"format": FORMAT, "schema": SCHEMA, "kind": kind, "volume": volume, **facts, "files": list(files)}
     )
-    return found
+    return document
 
 
 def write_index(path: str, index: dict[str, Any], overwrite: bool) -> None:
@@ -174,10 +174,10 @@ def shown_name(name: str, facts: Mapping[str, Any]) -> str:
 def files_of(path: str | Path) -> list[tuple[str, str]]:
     """List name on a page and file of each cloud of an index; raise DataError as `read_index`, or if one is missing."""
     folder = Path(path).parent
-    found = [(shown_name(row["name"], row), folder / row["file"]) for row in read_index(path)["files"]]
-    if gone := [file for _, file in found if not file.is_file()]:
+    clouds = [(shown_name(row["name"], row), folder / row["file"]) for row in read_index(path)["files"]]
+    if gone := [file for _, file in clouds if not file.is_file()]:
         raise DataError(f"{path}: its file {gone[0]} is missing; run the conversion again")
-    return [(name, str(file)) for name, file in found]
+    return [(name, str(file)) for name, file in clouds]
 
 
 def named_files(names: Sequence[str]) -> list[tuple[str, str]]:
@@ -187,11 +187,11 @@ def named_files(names: Sequence[str]) -> list[tuple[str, str]]:
         UsageError: as `expanded`.
         DataError: as `files_of`.
     """
-    found: list[tuple[str, str]] = []
+    files: list[tuple[str, str]] = []
     for name in names:
         name = os.path.join(name, MANIFEST) if os.path.isfile(os.path.join(name, MANIFEST)) else name
-        found += files_of(name) if is_index(name) else [(Path(file).name, file) for file in expanded(name)]
-    return found
+        files += files_of(name) if is_index(name) else [(Path(file).name, file) for file in expanded(name)]
+    return files
 
 
 def movie_frames(name: str) -> tuple[str | None, ...]:
@@ -216,7 +216,7 @@ def expanded(name: str) -> list[str]:
     levels = split_name(name)
     if not set(name) & set("*?[") or os.path.exists(name) or (levels and levels[0].is_file()) or ":/" in name:
         return [name]
-    found = [str(path) for path in matching(name)]
-    if not found:
+    files = [str(path) for path in matching(name)]
+    if not files:
         raise UsageError(f"{name}: no such files; expected files of Gaussians ({', '.join(SUFFIXES)}), or a volume")
-    return found if any(map(is_splats, found)) else [name]  # a glob may be a volume: slices
+    return files if any(map(is_splats, files)) else [name]  # a glob may be a volume: slices

@@ -39,8 +39,8 @@ class HiddenCells:
         """Return (K,) bool, whether the centre of each Gaussian is hidden."""
         voxels = (gaussians.means.astype(np.float64) + self.half) / self.step
         i, j, k = (self._along(axis, voxels[:, axis]) for axis in range(3))
-        found: np.ndarray = self.cells[k, j, i]
-        return found
+        hidden: np.ndarray = self.cells[k, j, i]
+        return hidden
 
     def meet_label(self, volume: Volume, number: int) -> bool:
         """Return whether part of a label's surface, where it meets other labels or the box, is hidden."""
@@ -65,8 +65,8 @@ class HiddenCells:
     def _along(self, axis: int, voxels: np.ndarray) -> np.ndarray:
         """Return (n,) int64, the cell along an axis of positions in voxels from the box's corner."""
         n = self.cells.shape[2 - axis]
-        found: np.ndarray = np.clip(np.floor(voxels / self.edge[axis]), 0, n - 1).astype(np.int64)
-        return found
+        cells: np.ndarray = np.clip(np.floor(voxels / self.edge[axis]), 0, n - 1).astype(np.int64)
+        return cells
 
 
 def hidden_cells(near: np.ndarray, edge: np.ndarray, half: np.ndarray, step: np.ndarray) -> HiddenCells:
@@ -104,7 +104,7 @@ def assign_labels(gaussians: Gaussians, shown: Sequence[tuple[Volume, LabelTable
             points = gaussians.means + offset * axes[:, :, axis]
             index = np.floor((points + frame.half) / frame.step).astype(np.int64)
             _vote(index, np.exp(-0.5 * offset**2) * tau, shown, votes)
-    found: np.ndarray = votes.argmax(axis=1)
+    labels: np.ndarray = votes.argmax(axis=1)
     lost = np.flatnonzero(votes.max(axis=1) == 0)
     near = _near(np.floor((gaussians.means[lost] + frame.half) / frame.step).astype(np.int64), tau, shown)
     colors = np.array([label.color for *_, label in shown])
@@ -112,21 +112,21 @@ def assign_labels(gaussians: Gaussians, shown: Sequence[tuple[Volume, LabelTable
         own = gaussians.colors[k]
         share = np.clip(colors @ own / np.maximum((colors**2).sum(axis=1), 1e-6), 0, 1)  # light darkens
         distance = np.abs(share[:, None] * colors - own).sum(axis=1) + DARKENED * (1 - share)
-        found[k] = np.where(candidates, distance, np.inf).argmin()
-    return found
+        labels[k] = np.where(candidates, distance, np.inf).argmin()
+    return labels
 
 
 def _near(index: np.ndarray, weights: np.ndarray, shown: Sequence[tuple[Volume, LabelTable, Label]]) -> np.ndarray:
     """Return (K, labels) bool, the labels near voxels ``index`` (K, 3) (x, y, z); all where none is within `REACH`."""
-    found = np.zeros((len(index), len(shown)), np.float32)
+    nearby = np.zeros((len(index), len(shown)), np.float32)
     for reach in REACH:
-        rows = np.flatnonzero(found.max(axis=1) == 0)
+        rows = np.flatnonzero(nearby.max(axis=1) == 0)
         votes = np.zeros((len(rows), len(shown)), np.float32)
         shifts = np.array(list(itertools.product((-reach, 0, reach), repeat=3)))
         around = (index[rows][:, None] + shifts).reshape(-1, 3)  # in one pass over a map that stays in its file
         _vote(around, weights, shown, votes, np.repeat(np.arange(len(rows)), len(shifts)))
-        found[rows] = votes
-    near: np.ndarray = (found > 0) | (found.max(axis=1, keepdims=True) == 0)
+        nearby[rows] = votes
+    near: np.ndarray = (nearby > 0) | (nearby.max(axis=1, keepdims=True) == 0)
     return near
 
 

@@ -25,11 +25,9 @@ from vvgt_cli.errors import DataError, NothingVisible
 from vvgt_cli.field.layered import IN_MEMORY, OpenedFile, content_of, is_plain, layers_of, open_content, told_apart
 from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
-from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.types import concatenate
+from vvgt_cli.gaussians import Gaussians, concatenate
+from vvgt_cli.look import AUTO, NO_LABELS, NONE, Label, LabelTable, LightOptions, check_labels
 from vvgt_cli.look.label_files import read_labels
-from vvgt_cli.look.labels import AUTO, NO_LABELS, Label, LabelTable, check_labels
-from vvgt_cli.look.lighting import NONE, LightOptions
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.volume import Volume
@@ -101,9 +99,9 @@ class Labels(Batch):
                 self._layers.append((own, _parts(own, content, names[-1] if len(sources) > 1 else "", tables, used)))
                 self.volume = self.volume or content.volumes[0].name
             self.facts = {"table": " + ".join(tables)}
-            found = [part for _, parts in self._layers for part in parts]
-            self.stems = [part.stem for part in found]
-            stage.note = f"{self.volume}, {len(found)} labels of {self.facts['table']}"
+            items = [part for _, parts in self._layers for part in parts]
+            self.stems = [part.stem for part in items]
+            stage.note = f"{self.volume}, {len(items)} labels of {self.facts['table']}"
 
     def items(self, run: Run, wanted: Callable[[str], bool]) -> Iterator[Item]:
         """Yield an item with its Gaussians for each label, and for each layer without labels."""
@@ -171,7 +169,7 @@ def _parts(
             if label.shown_opacity > 0 and extent is not None:
                 shown.append((volume, table, label, extent))
     numbers = [label.number for *_, label, _ in shown]
-    found: list[LabelItem] = []
+    items: list[LabelItem] = []
     divided = shares([extent.count for *_, extent in shown], request.fit.max_gaussians)
     for (volume, table, label, extent), share in zip(shown, divided, strict=True):
         alone = replace(_source(request, content, volume), labels=table.only(label.number))
@@ -181,8 +179,8 @@ def _parts(
         if layer:
             facts["parents"] = (layer, *label.parents)
         one = replace(request, source=alone, fit=replace(request.fit, max_gaussians=share))
-        found.append(MapLabel(label.name, stem, one, facts, volume, table, label))
-    return found
+        items.append(MapLabel(label.name, stem, one, facts, volume, table, label))
+    return items
 
 
 def _source(request: ConvertRequest, content: OpenedFile, volume: Volume) -> SourceRequest:

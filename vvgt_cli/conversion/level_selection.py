@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.rules import INRIA, Rule
+from vvgt_cli.gaussians import INRIA, Gaussians, Rule
 
 CUTS = 10
 STEP = 4.0  # factor of the score from a cut to the next: a cell's grows as the fourth power of its edge
@@ -45,14 +44,14 @@ class CutErrors:
     @property
     def errors(self) -> np.ndarray:
         """Return (N, CUTS) root mean square errors of a channel over the pixels that a node covers."""
-        found: np.ndarray = np.sqrt(self.squares / np.maximum(4 * self.pixels, 1)[:, None])
-        return found
+        errors: np.ndarray = np.sqrt(self.squares / np.maximum(4 * self.pixels, 1)[:, None])
+        return errors
 
     def at_price(self, price: float) -> np.ndarray:
         """Return (N,) cuts with the least sum of squared error and ``price`` per Gaussian."""
         costs = (self.squares + price * self.counts)[:, ::-1]
-        found: np.ndarray = costs.shape[1] - 1 - costs.argmin(axis=1)
-        return found
+        cuts: np.ndarray = costs.shape[1] - 1 - costs.argmin(axis=1)
+        return cuts
 
     def for_count(self, count: float) -> np.ndarray:
         """Return (N,) cuts of least total squared error with at most ``count`` Gaussians, by one price for all.
@@ -83,16 +82,16 @@ class CutErrors:
             removed: Gaussians that the finest has fewer than the budget, since more would be faint. The next level has
                 a ninth of the budget all the same, or the finest again.
         """
-        found = [np.zeros(len(self.counts), np.int64)]
-        before = self.total(found[0]) + removed
-        while len(found) < MAX_LEVELS and before >= FEWEST * len(self.counts):
+        levels = [np.zeros(len(self.counts), np.int64)]
+        before = self.total(levels[0]) + removed
+        while len(levels) < MAX_LEVELS and before >= FEWEST * len(self.counts):
             further = self.for_count(before / FEWER)
             count = self.total(further)
             if 2 * count > before:
                 break
-            found.append(further)
+            levels.append(further)
             before = count
-        return found
+        return levels
 
     def facts(self, row: int, choice: list[int]) -> dict[str, Any]:
         """Return relative squared errors of a node's levels, as splat-transform's `errors`, and RMS errors."""

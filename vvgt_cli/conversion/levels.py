@@ -95,10 +95,10 @@ def _levels(
     task: WrittenFiles, counts: np.ndarray, spreads: np.ndarray, errors: CutErrors, choices: np.ndarray
 ) -> list[dict[str, Any]]:
     """Return what the manifest says of each level."""
-    found = []
+    rows = []
     for k, sums in enumerate(spreads.sum(axis=0)):
         own = [number for number, part in enumerate(task.parts) if part.level == k]
-        found.append(
+        rows.append(
             {
                 "gaussians": int(counts[:, k].sum()),
                 "bytes": sum(task.size(number) for number in own),
@@ -107,7 +107,7 @@ def _levels(
                 "rms": errors.rms(choices[:, k]),
             }
         )
-    return found
+    return rows
 
 
 def _manifest(
@@ -244,9 +244,9 @@ class WrittenFiles:
         """Return the lowest and highest corners (nodes, 3) of all nodes, over their levels."""
         low, high = np.full((nodes, 3), np.inf), np.full((nodes, 3), -np.inf)
         for number, part in enumerate(self.parts):
-            found, own = self.gaussians.store.load(self.kind, number), slice(part.begin, part.end)
-            low[own] = np.minimum(low[own], found["lows"])
-            high[own] = np.maximum(high[own], found["highs"])
+            corners, own = self.gaussians.store.load(self.kind, number), slice(part.begin, part.end)
+            low[own] = np.minimum(low[own], corners["lows"])
+            high[own] = np.maximum(high[own], corners["highs"])
         return low, high
 
 

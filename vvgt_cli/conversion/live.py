@@ -15,7 +15,6 @@ import numpy as np
 from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.closed_form import Start
 from vvgt_cli.closed_form.columns import MASS
-from vvgt_cli.conversion.gaussian_files import is_page
 from vvgt_cli.conversion.place import to_box_frame, to_frame_of, to_unit_frame
 from vvgt_cli.conversion.recolored import Look, SeveralLooks, lookup_table, visible_cloud
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
@@ -27,6 +26,7 @@ from vvgt_cli.field.field import Field
 from vvgt_cli.field.source import StyledVolume
 from vvgt_cli.field.workload import Workload
 from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians.formats import is_page
 from vvgt_cli.gaussians.live import LENGTH, Looks, Table, baked, lengths
 from vvgt_cli.gaussians.live_facts import AXIS, LAYER_ID, LiveFacts, grain_of
 from vvgt_cli.gaussians.types import concatenate

@@ -50,11 +50,11 @@ def parse_shard(text: str) -> Shard:
 
 def file_digest(path: Path) -> str:
     """Return the sha256 of a file, of levels with the files that their manifest names, hexadecimal."""
-    found = hashlib.sha256()
+    sha256 = hashlib.sha256()
     for each in (path, *level_files(path)):
         with each.open("rb") as file:
-            hashlib.file_digest(file, lambda: found)
-    return found.hexdigest()
+            hashlib.file_digest(file, lambda: sha256)
+    return sha256.hexdigest()
 
 
 @dataclass
@@ -93,10 +93,10 @@ class Manifest:
             UsageError: the folder holds files of another run, or files that no manifest lists.
             DataError: a manifest is invalid.
         """
-        found = self._manifests()
+        manifests = self._manifests()
         if overwrite:
-            self._clear(found)
-        for path in [] if overwrite else found:
+            self._clear(manifests)
+        for path in [] if overwrite else manifests:
             document = read_manifest(path, self.what)
             if document["hash"] != self.hash:
                 raise UsageError(
@@ -106,7 +106,7 @@ class Manifest:
             if path.name == self.shard.manifest:
                 self.recorded = document["files"]
         self.files |= self.recorded
-        if not found and not overwrite:
+        if not manifests and not overwrite:
             for name in planned:
                 if (self.folder / name).exists():
                     raise UsageError(f"{self.folder}: {name} exists, and no manifest; {FRESH}")
@@ -122,8 +122,8 @@ class Manifest:
             return []
         return sorted(path for path in self.folder.iterdir() if NAME.fullmatch(path.name))
 
-    def _clear(self, found: list[Path]) -> None:
-        for path in found:
+    def _clear(self, manifests: list[Path]) -> None:
+        for path in manifests:
             try:
                 written = read_manifest(path, self.what)["files"]
             except DataError:  # not our manifest: only this file is replaced
@@ -173,12 +173,12 @@ def read_manifest(path: Path, what: str = "views") -> dict[str, Any]:
 
 def difference(there: dict[str, Any], here: dict[str, Any], what: str = "views") -> str:
     """Return a line with the differences between two runs."""
-    found = []
+    differences = []
     for key in dict.fromkeys([*here, *there]):
         a, b = there.get(key), here.get(key)
         if a != b:
-            found.append(DIGESTS.get(key) or f"{key.replace('_', ' ')} {_shown(a)} there, {_shown(b)} here")
-    return f"holds {what} of another run: " + (", ".join(found) or "its manifest was edited")
+            differences.append(DIGESTS.get(key) or f"{key.replace('_', ' ')} {_shown(a)} there, {_shown(b)} here")
+    return f"holds {what} of another run: " + (", ".join(differences) or "its manifest was edited")
 
 
 def _shown(value: Any) -> str:

@@ -20,8 +20,8 @@ from vvgt_cli.conversion.level_selection import CUTS, STEP, CutErrors, errors_of
 from vvgt_cli.conversion.levels import NEAREST
 from vvgt_cli.conversion.request import FitOptions, Limits
 from vvgt_cli.conversion.stage import Work
+from vvgt_cli.conversion.stages.cells import Network
 from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT, TOO_FAINT, halve_budget_while_faint
-from vvgt_cli.conversion.stages.network import Network
 from vvgt_cli.conversion.stages.refinement import Refinement
 from vvgt_cli.conversion.stages.views import CheckViews, TrainingViews, view_count
 from vvgt_cli.conversion.stored import FinishedParts, Levels, StoredGaussians, save
@@ -30,9 +30,7 @@ from vvgt_cli.dvr.render import BoxFrame
 from vvgt_cli.field.digests import digest
 from vvgt_cli.field.part import VolumePart
 from vvgt_cli.field.reader import Layers, Scalars
-from vvgt_cli.gaussians import Gaussians, as_stored
-from vvgt_cli.gaussians.rules import INRIA
-from vvgt_cli.gaussians.types import concatenate
+from vvgt_cli.gaussians import INRIA, Gaussians, as_stored, concatenate
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 

@@ -8,18 +8,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera
-from vvgt_cli.cameras.boxed import render_in_box
-from vvgt_cli.gaussians import Gaussians, PlyOptions
+from vvgt_cli.cameras import Camera, render_in_box
+from vvgt_cli.gaussians import INRIA, Gaussians, PlyOptions, Rule
 from vvgt_cli.gaussians.frames import rescale, transform, upright_matrix
 from vvgt_cli.gaussians.live import LENGTH
-from vvgt_cli.gaussians.rules import INRIA, Rule
 from vvgt_cli.volume import UnitFrame, Volume
 from vvgt_cli.volume.space import shear_text, world_axis
 
 if TYPE_CHECKING:
-    from vvgt_cli.dvr import Scene
-    from vvgt_cli.dvr.render import Viewed
+    from vvgt_cli.dvr import Scene, Viewed
     from vvgt_cli.score.viewing import Axes
     from vvgt_cli.splat.render import Shown
 
@@ -80,18 +77,18 @@ def with_place(ply: PlyOptions, volume: Volume) -> PlyOptions:
 
 def placement_warnings(volume: Volume, ply: PlyOptions) -> list[str]:
     """Return warnings about the place of a volume: sheared axes, or a rotation that the file will not record."""
-    found = []
+    warnings = []
     if volume.sheared:
-        found.append(
+        warnings.append(
             f"{volume.name}: {shear_text(volume.axes)} (a tilted gantry?): Gaussians are sheared with them; opacity "
             "stays per length along the index axes, and pictures are of the volume unsheared"
         )
     if not ply.comments and (ply.up != NONE or ply.frame != "unit"):
-        found.append(
+        warnings.append(
             f"--no-comments: the file will not record that it is in the {ply.frame} frame with up {ply.up}; "
             "'vvgt evaluate' and 'vvgt render' will assume the unit frame with up none"
         )
-    return found
+    return warnings
 
 
 def upright_axes(volume: Volume, up: str) -> np.ndarray:

@@ -1,13 +1,14 @@
-"""The plan of a conversion: a list of stages, chosen by their costs and the user's limits."""
+"""The plan of a conversion: a list of stages, chosen by their costs and the user's limits, or a warm start."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
-from vvgt_cli.conversion.request import FitOptions, Limits, file_bytes
-from vvgt_cli.conversion.stage import Stage
+from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits, file_bytes
+from vvgt_cli.conversion.stage import Stage, Work
 from vvgt_cli.conversion.stages import (
     BackProjection,
     CellsByError,
@@ -23,6 +24,7 @@ from vvgt_cli.conversion.stages.parts import OutOfCore
 from vvgt_cli.conversion.stages.refinement import most_steps, steps_in_time
 from vvgt_cli.conversion.stages.views import view_count
 from vvgt_cli.errors import UsageError
+from vvgt_cli.field.field import ViewRenderer
 from vvgt_cli.field.workload import Workload, for_budget, view_edge
 from vvgt_cli.resources import free_memory
 from vvgt_cli.score.record import Run
@@ -289,3 +291,29 @@ def report_target(run: Run, fit: FitOptions, megabytes: float | None) -> None:
         run.console.message(
             f"for {fit.target}: at most {most}{fit.max_gaussians} Gaussians, {fit.screen} px, drawn as {fit.rule}"
         )
+
+
+class WarmStart(ABC):
+    """Gaussians of an earlier conversion, tried before the closed form."""
+
+    @abstractmethod
+    def try_start(self, work: Work, plan: Plan, request: ConvertRequest) -> bool:
+        """Derive the Gaussians of ``work`` from the earlier ones, and return whether they are as good as new ones.
+
+        If they are not, ``work`` is reset.
+        """
+
+    def renderer(self, views: ViewRenderer) -> ViewRenderer | None:
+        """Return the renderer to convert by, which caches pictures of ``views``; None for no other."""
+        return None
+
+    def keep(self, work: Work, plan: Plan) -> None:  # noqa: B027
+        """Store a conversion that did not start from another."""
+
+    def facts(self) -> dict[str, Any]:
+        """Return entries of the index for the last conversion."""
+        return {}
+
+    def memory(self, plan: Plan, fit: FitOptions) -> tuple[int, Callable[[Workload], float]]:
+        """Return the bytes of pictures that it will keep, and a function of a workload for those of Gaussians."""
+        return 0, lambda _: 0.0

@@ -8,22 +8,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera
-from vvgt_cli.cameras.blocks import BLOCK, Blocks
+from vvgt_cli.cameras import BLOCK, Blocks, Camera
 from vvgt_cli.conversion.changes import Changes, changes
-from vvgt_cli.conversion.plan import Plan
+from vvgt_cli.conversion.plan import Plan, WarmStart
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import CheckViews, TrainingViews
 from vvgt_cli.conversion.stages.refinement import Refinement, refine, widen_small
 from vvgt_cli.conversion.stages.scores import TestViews
-from vvgt_cli.conversion.warm_start import WarmStart
 from vvgt_cli.defaults import WARM_STEPS
 from vvgt_cli.field.field import Picture, ViewRenderer
 from vvgt_cli.field.source import StyledVolume
 from vvgt_cli.field.workload import Workload
-from vvgt_cli.gaussians import Gaussians, as_stored
-from vvgt_cli.gaussians.rules import Rule
+from vvgt_cli.gaussians import Gaussians, Rule, as_stored
 from vvgt_cli.refine import OptimizeOptions
 from vvgt_cli.score.views import Views
 
@@ -103,16 +100,16 @@ class PreviousFrame(WarmStart):
             self._pictures.invalidate(None)
             return False
         with work.run.stage("differences") as stage:
-            found = changes(last.source, work.field.source)
-            free = found.meet(last.gaussians)
-            self._pictures.invalidate(found)
-            stage.note = f"{found.blocks.mean():.1%} of the volume, {int(free.sum())} of {len(free)} Gaussians"
+            differing = changes(last.source, work.field.source)
+            free = differing.meet(last.gaussians)
+            self._pictures.invalidate(differing)
+            stage.note = f"{differing.blocks.mean():.1%} of the volume, {int(free.sum())} of {len(free)} Gaussians"
         work.gaussians = last.gaussians
-        if found.blocks.any() and not self._fitted(work, last, found, free):
+        if differing.blocks.any() and not self._fitted(work, last, differing, free):
             work.reset()
             return False
         shown = last.shown
-        if found.blocks.any():  # else no view was drawn
+        if differing.blocks.any():  # else no view was drawn
             turn = self._turn % len(shown)
             shown = (*shown[:turn], work.current(), *shown[turn + 1 :])
             self._turn += 1
@@ -133,7 +130,7 @@ class PreviousFrame(WarmStart):
                 work.field.source, made, work.psnr(made), cameras, work.train_rule, work.train_settings, shown
             )
 
-    def _fitted(self, work: Work, last: _Frame, found: Changes, free: np.ndarray) -> bool:
+    def _fitted(self, work: Work, last: _Frame, differing: Changes, free: np.ndarray) -> bool:
         """Refine the Gaussians that are ``free`` (K,) bool, and return whether the result is good enough."""
         from vvgt_cli.dvr import render_views
 
@@ -153,7 +150,7 @@ class PreviousFrame(WarmStart):
                 _keep_unchanged(image, old, last.shown[turn], camera, last.rule)
             stage.note = f"{len(cameras)} of {cameras[0].width} px to fit to, where they differ from the previous frame"
         assert work.check is not None
-        compared, psnr = _changed_blocks(work.check, found), 0.0
+        compared, psnr = _changed_blocks(work.check, differing), 0.0
         asked = work.fit.steps
         left = ROUNDS * WARM_STEPS if asked is None else min(asked, ROUNDS * WARM_STEPS)
         while left > 0:
@@ -197,11 +194,11 @@ def _count_differing(first: Gaussians, second: Gaussians) -> int:
     return int(np.any([(a != b).reshape(len(first), -1).any(axis=1) for a, b in pairs], axis=0).sum())
 
 
-def _changed_blocks(views: Views, found: Changes) -> Views:
+def _changed_blocks(views: Views, differing: Changes) -> Views:
     """Return the blocks of views that show differences, to compare; all views where none does."""
     cameras, images, blocks = [], [], []
     for k, camera in enumerate(views.cameras):
-        shown = found.seen_by(camera)
+        shown = differing.seen_by(camera)
         shown[camera.height // BLOCK :], shown[:, camera.width // BLOCK :] = (
             False,
             False,
@@ -262,8 +259,8 @@ class RememberedViews:
 
     def last(self, view: Picture) -> np.ndarray | None:
         """Return a cached picture (h, w, 4), whose blocks may be of different frames; None without one."""
-        found = self._kept.get(_key(view))
-        return None if found is None else found[1].copy()
+        kept = self._kept.get(_key(view))
+        return None if kept is None else kept[1].copy()
 
     def new_bytes(self, views: Sequence[Picture]) -> int:
         """Return the bytes that caching ``views`` would add."""
@@ -272,11 +269,11 @@ class RememberedViews:
 
     def missing(self, view: Picture) -> Blocks | None:
         """Return the blocks of a picture that have to be drawn; None for the whole."""
-        found = self._kept.get(_key(view))
-        if found is None:
+        kept = self._kept.get(_key(view))
+        if kept is None:
             return view.blocks
-        numbers = np.flatnonzero(~found[2]) if view.blocks is None else view.blocks.numbers
-        return Blocks(view.camera.width, view.camera.height, numbers[~found[2].ravel()[numbers]])
+        numbers = np.flatnonzero(~kept[2]) if view.blocks is None else view.blocks.numbers
+        return Blocks(view.camera.width, view.camera.height, numbers[~kept[2].ravel()[numbers]])
 
     def put(self, view: Picture, drawn: Blocks | None, image: np.ndarray) -> np.ndarray:
         """Cache the blocks ``drawn`` in ``image`` (h, w, 4), and return the picture with the cached ones."""

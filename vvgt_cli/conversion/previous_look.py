@@ -10,13 +10,12 @@ import numpy as np
 
 from vvgt_cli.conversion.live import box_lighting, function_table
 from vvgt_cli.conversion.place import to_box_frame
-from vvgt_cli.conversion.plan import Plan
+from vvgt_cli.conversion.plan import Plan, WarmStart
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import CheckViews, Refinement, TestViews, TrainingViews
 from vvgt_cli.conversion.stages.views import suits_small_views, view_count
-from vvgt_cli.conversion.warm_start import WarmStart
 from vvgt_cli.defaults import WARM_STEPS
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.field import Field
@@ -24,7 +23,6 @@ from vvgt_cli.field.source import StyledVolume
 from vvgt_cli.field.workload import view_edge
 from vvgt_cli.gaussians import Gaussians, as_stored
 from vvgt_cli.gaussians.live import TAU
-from vvgt_cli.gaussians.ply import opacity
 from vvgt_cli.jit.ahead import LIVE
 
 FAR = 7.5  # dB on the check views below the last cold conversion, before the steps
@@ -123,7 +121,7 @@ def recolor_earlier(earlier: Conversion, field: Field) -> Gaussians:
     new, b = _look_alone(source, gaussians, samples)
     least = max(FAINT * float(a.mean()), 1e-30)  # where the earlier look showed nothing
     ratio = np.where(there, ((b + least) / (a + least)).clip(1 / MAX_RATIO, MAX_RATIO), 1)
-    depth = -np.log1p(-np.minimum(opacity(gaussians).astype(np.float64), OPAQUE[1])) * ratio
+    depth = -np.log1p(-np.minimum(gaussians.opacity, OPAQUE[1])) * ratio
     peak = (-np.expm1(-depth)).clip(*OPAQUE)
     alike = 1 - np.linalg.norm(new.colors - old.colors, axis=1) / OTHER
     kept = np.where(there & (a > least), alike.clip(0, 1), 0)[:, None]

@@ -10,15 +10,11 @@ import numpy as np
 from vvgt_cli.cameras.sets import SIZE, pixel_width
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.source import layer_words
-from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions
-from vvgt_cli.gaussians.constants import MIN_ALPHA
+from vvgt_cli.gaussians import MIN_ALPHA, Gaussians, PlyHeader, PlyOptions
 from vvgt_cli.gaussians.header import FileFacts, legend_text
 from vvgt_cli.gaussians.live import LayerTables, Looks, Palette, Table, apply_look, visible_under
 from vvgt_cli.gaussians.live_facts import AXIS, LiveFacts
-from vvgt_cli.gaussians.ply import opacity
-from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.look.labels import LabelTable, check_labels
-from vvgt_cli.look.lighting import Lighting, LightOptions
+from vvgt_cli.look import LabelTable, Lighting, LightOptions, TransferFunction, check_labels
 from vvgt_cli.look.resolve import unit_of_values
 from vvgt_cli.volume import Volume
 
@@ -110,10 +106,10 @@ def apply_function(
     assert facts.scale is not None
     assert options.unit_distance is not None
     table = lookup_table(facts.live, tf, options.unit_distance, facts.scale)
-    found = visible_cloud(gaussians, table, options.light, pixel_width(options.screen_size or SIZE))
-    if not (len(found) or empty):
+    visible = visible_cloud(gaussians, table, options.light, pixel_width(options.screen_size or SIZE))
+    if not (len(visible) or empty):
         raise DataError(f"{tf.name}: not one of {len(gaussians)} Gaussians is visible; try another function")
-    return found
+    return visible
 
 
 def lookup_table(facts: LiveFacts, tf: Look, distance: float, scale: float) -> Looks:
@@ -144,14 +140,14 @@ def visible_cloud(gaussians: Gaussians, table: Looks, lighting: Lighting | None,
     """
     seen = gaussians.take(visible_under(gaussians, table, pixel))
     assert seen.live is not None
-    found = apply_look(seen, table, pixel)
-    there = np.flatnonzero(opacity(found) >= MIN_ALPHA)
-    found, axis = found.take(there), seen.live[there, AXIS]
+    shown = apply_look(seen, table, pixel)
+    there = np.flatnonzero(shown.opacity >= MIN_ALPHA)
+    shown, axis = shown.take(there), seen.live[there, AXIS]
     if lighting is None:
-        return found
+        return shown
     from vvgt_cli.closed_form.relight import relight
 
-    return relight(found, axis, lighting)
+    return relight(shown, axis, lighting)
 
 
 def resolve_look(name: str, header: PlyHeader | PlyOptions, function: FunctionRequest) -> tuple[Look, PlyOptions]:
@@ -241,10 +237,10 @@ def layer_number(name: str, layers: Sequence[LiveFacts], asked: str) -> int:
     if asked.isdecimal() and int(asked) < len(layers):
         return int(asked)
     exact = [k for k, layer in enumerate(layers) if layer.name == asked]
-    found = exact or [k for k, layer in enumerate(layers) if asked.lower() in layer.name.lower()]
-    if len(found) != 1:
-        raise UsageError(f"{name}: --layer {asked}: {len(found) or 'no'} layers of that name; {_listed(layers)}")
-    return found[0]
+    numbers = exact or [k for k, layer in enumerate(layers) if asked.lower() in layer.name.lower()]
+    if len(numbers) != 1:
+        raise UsageError(f"{name}: --layer {asked}: {len(numbers) or 'no'} layers of that name; {_listed(layers)}")
+    return numbers[0]
 
 
 def layer_look(

@@ -13,7 +13,7 @@ from vvgt_cli.field.settings import MANY, BlockOptions
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.files import is_stream
 from vvgt_cli.gaussians import PlyOptions
-from vvgt_cli.gaussians.formats import SUFFIXES, format_of
+from vvgt_cli.gaussians.formats import SUFFIXES, format_of, is_page
 from vvgt_cli.gaussians.formats.page_file import page_bytes
 from vvgt_cli.gaussians.formats.page_values import SMALLEST as SMALLEST_VALUES
 from vvgt_cli.gaussians.formats.streamed import MANIFEST, is_streamed
@@ -169,7 +169,7 @@ class ConvertRequest:
             UsageError: not even one fits, or the size limit is neither for a `.ply` nor for a page.
         """
         degree, known = (self.ply.sh_degree or 0) if degree is None else degree, format_of(self.output or "")
-        if known is not None and known.suffix == ".html":
+        if is_page(self.output):
             header, each = page_bytes(degree)
             header += (SMALLEST_VALUES if self.values else 0) + (self.story.size if self.story else 0)
         elif self.limits.max_megabytes is not None and (known is not None or is_streamed(self.output)):
@@ -186,7 +186,7 @@ class ConvertRequest:
         target, known = target_of(self.fit.target), format_of(self.output or "")
         if self.limits.max_megabytes is not None or target is None:
             return self.limits.max_megabytes
-        limited = not self.live if known is None else known.suffix == ".html"
+        limited = not self.live if known is None else is_page(self.output)
         return target.megabytes if limited and not (self.shares_output or is_streamed(self.output)) else None
 
     @property

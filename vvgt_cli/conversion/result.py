@@ -90,7 +90,7 @@ class Result:
             sh_degree: degree in the file, 0 to 3: missing harmonics are zeros, those above it are dropped.
             comments: describe the file in its header.
             values: a page of a conversion also holds the values of its volume, so that its look can be changed.
-            story: for a page to tell: a ``story.json`` or its content (docs/live.md).
+            story: for a page to tell: a ``story.json`` or its content (docs/page.md).
             overwrite: replace an existing file; the default, since cells of notebooks are run again.
 
         Returns:

@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 from vvgt_cli.conversion.request import FitOptions, Limits
 from vvgt_cli.conversion.resume import Checkpoint
 from vvgt_cli.field.workload import Workload
-from vvgt_cli.gaussians import Gaussians, PlyOptions
-from vvgt_cli.gaussians.rules import Rule, rule_of
-from vvgt_cli.score.record import Run
+from vvgt_cli.gaussians import Gaussians, PlyOptions, Rule, rule_of
+from vvgt_cli.score.record import Run, StageRecord
 from vvgt_cli.score.views import Views
 
 if TYPE_CHECKING:
@@ -116,11 +115,11 @@ class Work:
         target = self.limits.target_psnr
         return target is not None and self.check is not None and self.psnr(self.current()) >= target
 
-    def keep_better(self, before: float, after: float, gaussians: Gaussians) -> bool:
-        """Take ``gaussians`` if their PSNR ``after`` is better, and return whether it is."""
-        if after > before:
-            self.gaussians = gaussians
-        return after > before
+    def keep_better(self, record: StageRecord, before: float, gaussians: Gaussians) -> None:
+        """Take ``gaussians`` if their PSNR is better than ``before`` (dB), and record both."""
+        record.psnr_before, record.psnr = before, self.psnr(gaussians)
+        record.kept = record.psnr > before
+        self.gaussians = gaussians if record.kept else self.gaussians
 
 
 @dataclass(frozen=True)

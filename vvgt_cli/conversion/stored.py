@@ -10,8 +10,7 @@ import numpy as np
 from vvgt_cli.conversion.cut import Cut, TileGaussians
 from vvgt_cli.conversion.level_selection import FIELDS, CutErrors
 from vvgt_cli.field.block_store import BlockStore
-from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.types import concatenate
+from vvgt_cli.gaussians import Gaussians, concatenate
 
 
 def save(
@@ -71,8 +70,8 @@ class StoredGaussians:
 
     def errors(self) -> CutErrors:
         """Return the errors of refined levels."""
-        found = {name: self.field(name) for name in FIELDS}
-        return CutErrors(np.zeros(found["counts"].shape[1]), **found)
+        fields = {name: self.field(name) for name in FIELDS}
+        return CutErrors(np.zeros(fields["counts"].shape[1]), **fields)
 
 
 @dataclass(frozen=True)

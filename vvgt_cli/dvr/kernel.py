@@ -151,8 +151,8 @@ def composite(u0: float, u1: float, dt: float, optics: Optics, light: Quad, tran
 @_jit
 def is_flat(optics: Optics) -> bool:
     """Return whether no segment needs finer samples: the whole function is flat."""
-    found: bool = optics.flat[0] >= optics.flat.shape[0] - 1
-    return found
+    flat: bool = optics.flat[0] >= optics.flat.shape[0] - 1
+    return flat
 
 
 @_jit

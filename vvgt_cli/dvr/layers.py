@@ -12,13 +12,11 @@ from functools import cached_property
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.look.labels import LabelTable
+from vvgt_cli.look import LabelTable, TransferFunction
 from vvgt_cli.look.tables import extinction
-from vvgt_cli.volume import Volume
+from vvgt_cli.volume import Volume, triple
 from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.stored import read_block
-from vvgt_cli.volume.types import triple
 
 SAME = 1e-3  # voxels up to which two grids are one
 SLAB = 16  # slices that are laid out at once

@@ -44,8 +44,8 @@ def scene_light(
     directions = np.array([_unit(inward @ np.array(d)) for d in lighting.directions]).reshape(-1, 3)
     cell, shade = shade_cell(shape), np.ones((1, 1, 1, 1), np.float32)
     if lighting.attenuated:
-        found, grids = extinction(cell), []
-        matter, wanted = Matter.of(found, step * cell), dilate(found > 0)  # where there is nothing, nothing is lit
+        density, grids = extinction(cell), []
+        matter, wanted = Matter.of(density, step * cell), dilate(density > 0)  # where there is nothing, nothing is lit
         if lighting.shadows:
             grids += [transmittance(matter, cone(d, ANGLE, RAYS), 1, wanted=wanted) for d in directions]
         if lighting.occlusion is not None:
@@ -122,8 +122,8 @@ def cone(axis: np.ndarray, angle: float, count: int) -> np.ndarray:
     radius = math.tan(math.radians(angle)) * np.sqrt((n + 0.5) / count)
     turn = math.pi * (3 - math.sqrt(5)) * n
     off = radius[:, None] * (np.cos(turn)[:, None] * first + np.sin(turn)[:, None] * second)
-    found: np.ndarray = (axis + off) / np.linalg.norm(axis + off, axis=1, keepdims=True)
-    return found
+    directions: np.ndarray = (axis + off) / np.linalg.norm(axis + off, axis=1, keepdims=True)
+    return directions
 
 
 def sphere(count: int) -> np.ndarray:
@@ -136,5 +136,5 @@ def sphere(count: int) -> np.ndarray:
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:
-    found: np.ndarray = vector / np.linalg.norm(vector)
-    return found
+    unit: np.ndarray = vector / np.linalg.norm(vector)
+    return unit

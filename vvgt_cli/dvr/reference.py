@@ -56,8 +56,8 @@ def optics_at(scene: Scene, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     """Return extinction (n,) per unit-frame length and colour (n, 3) at voxel coordinates (n, 3)."""
     if scene.grid is None:
         return optics(scene, trilinear(scene.volume, points))
-    found = grid_values(scene.grid, points)
-    return found[:, 3], found[:, :3] / np.where(found[:, 3:] > 0, found[:, 3:], 1)
+    values = grid_values(scene.grid, points)
+    return values[:, 3], values[:, :3] / np.where(values[:, 3:] > 0, values[:, 3:], 1)
 
 
 def normals(scene: Scene, points: np.ndarray) -> np.ndarray:

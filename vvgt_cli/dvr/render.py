@@ -10,8 +10,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera
-from vvgt_cli.cameras.blocks import Blocks
+from vvgt_cli.cameras import Blocks, Camera
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.errors import UsageError
 from vvgt_cli.progress import ProgressCallback

@@ -9,8 +9,7 @@ import numpy as np
 
 from vvgt_cli.dvr.layout import Light, Texels, Voxels, pairs_fit
 from vvgt_cli.dvr.light import scene_light
-from vvgt_cli.look.function import Named, TransferFunctionLike
-from vvgt_cli.look.lighting import Lighting
+from vvgt_cli.look import Lighting, Named, TransferFunctionLike
 from vvgt_cli.look.tables import Optics, build_tables
 from vvgt_cli.volume import Volume
 

@@ -84,8 +84,8 @@ def four(typingctx: Any, values: Any, index: Any) -> Any:
         array = context.make_array(signature.args[0])(context, builder, args[0])
         kind = ir.VectorType(context.get_data_type(values.dtype), 4)
         start = builder.gep(array.data, [args[1]])
-        found = builder.load(builder.bitcast(start, kind.as_pointer()), align=values.dtype.bitwidth // 8)
-        return (builder.fpext if isinstance(values.dtype, types.Float) else builder.uitofp)(found, QUAD)
+        loaded = builder.load(builder.bitcast(start, kind.as_pointer()), align=values.dtype.bitwidth // 8)
+        return (builder.fpext if isinstance(values.dtype, types.Float) else builder.uitofp)(loaded, QUAD)
 
     return quad(values, index), codegen
 
@@ -95,10 +95,10 @@ def vector(typingctx: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
     """Return (a, b, c, d)."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        found = ir.Constant(QUAD, ir.Undefined)
+        packed = ir.Constant(QUAD, ir.Undefined)
         for n, part in enumerate(args):
-            found = builder.insert_element(found, part, ir.Constant(ir.IntType(32), n))
-        return found
+            packed = builder.insert_element(packed, part, ir.Constant(ir.IntType(32), n))
+        return packed
 
     return quad(types.float64, types.float64, types.float64, types.float64), codegen
 

@@ -41,7 +41,7 @@ class BlockStore:
         text = json.dumps(settings, sort_keys=True, indent=1)
         place = self.folder / RUN
         # shards start together: `place`, the first file, may come at any moment, and until then has a hidden name
-        found = list(self.folder.iterdir()) if self.folder.is_dir() else []
+        content = list(self.folder.iterdir()) if self.folder.is_dir() else []
         there = place.is_file()
         same = there and place.read_text("utf-8") == text
         if there and not same and not ours:
@@ -49,7 +49,7 @@ class BlockStore:
                 f"{self.folder}: holds the blocks of another run ({differences(place, settings)}); choose another "
                 "name, or remove the folder"
             )
-        if not there and not ours and any(not path.name.startswith(".run.") for path in found):
+        if not there and not ours and any(not path.name.startswith(".run.") for path in content):
             raise UsageError(f"{self.folder}: exists and holds no blocks of vvgt; choose another name")
         if not same and ours:
             shutil.rmtree(self.folder, ignore_errors=True)
@@ -67,21 +67,21 @@ class BlockStore:
     def kept_edge(self, settings: dict[str, Any]) -> int | None:
         """Return the block edge of an earlier run with the same settings, None if there was none."""
         try:
-            found = dict(self.settings())
+            stored = dict(self.settings())
         except UsageError:
             return None
-        edge = found.pop("blocks", None)
-        return edge if found == json.loads(json.dumps(settings)) else None
+        edge = stored.pop("blocks", None)
+        return edge if stored == json.loads(json.dumps(settings)) else None
 
     def settings(self) -> dict[str, Any]:
         """Return the settings given to `open`; raise UsageError if this is not a folder of blocks."""
         try:
-            found = json.loads((self.folder / RUN).read_text("utf-8"))
+            stored = json.loads((self.folder / RUN).read_text("utf-8"))
         except (OSError, ValueError):
             raise UsageError(
                 f"{self.folder}: not a folder of blocks; expected what 'vvgt init --shard' wrote"
             ) from None
-        return dict(found)
+        return dict(stored)
 
     def path(self, kind: str, number: int, suffix: str = ".npz") -> Path:
         """Return the path of a block's result."""
@@ -114,21 +114,21 @@ class BlockStore:
         self, kind: str, number: int, suffix: str = ".npz", names: Collection[str] | None = None
     ) -> dict[str, np.ndarray]:
         """Return the arrays of a result, by default all; raise DataError if the file is missing or damaged."""
-        with self._opened(kind, number, suffix) as found:
-            return {name: found[name] for name in (found.files if names is None else names)}
+        with self._opened(kind, number, suffix) as arrays:
+            return {name: arrays[name] for name in (arrays.files if names is None else names)}
 
     def names(self, kind: str, number: int, suffix: str = ".npz") -> frozenset[str]:
         """Return the names of a result's arrays; raise DataError if the file is missing or damaged."""
-        with self._opened(kind, number, suffix) as found:
-            return frozenset(found.files)
+        with self._opened(kind, number, suffix) as arrays:
+            return frozenset(arrays.files)
 
     @contextmanager
     def _opened(self, kind: str, number: int, suffix: str) -> Iterator[Any]:
         """Open a result; zipfile, zlib and numpy raise many types, here and while it is read."""
         path = self.path(kind, number, suffix)
         try:
-            with np.load(path) as found:
-                yield found
+            with np.load(path) as arrays:
+                yield arrays
         except FileNotFoundError as error:
             text = f"{path}: block {number} is missing; remove its other files and run its shard again"
             raise DataError(text) from error

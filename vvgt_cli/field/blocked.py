@@ -9,9 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera, default_views
-from vvgt_cli.cameras.blocks import Blocks
-from vvgt_cli.cameras.sets import pixel_width
+from vvgt_cli.cameras import Blocks, Camera, default_views, pixel_width
 from vvgt_cli.closed_form.columns import MOMENTS
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.dvr.render import BoxFrame, Rays, RenderSettings, first_rays, for_thin, more_rays
@@ -197,9 +195,9 @@ class Blocked(Field):
         self.expect([view])
         if self.pictures[view.key][1] is None:
             self._render_pending()
-        found = self.pictures[view.key][1]
-        assert found is not None
-        return found if blocks is None else blocks.image(found)
+        image = self.pictures[view.key][1]
+        assert image is not None
+        return image if blocks is None else blocks.image(image)
 
     def forget(self, picture: Picture) -> None:
         """Implement `ViewRenderer.forget`."""
@@ -270,7 +268,7 @@ class Blocked(Field):
         out = np.zeros((len(at), 4))
         for number in range(len(task)):
             part = store.load(kind, number)
-            out[part["which"]] = part["found"]
+            out[part["which"]] = part["normals"]
         return out
 
     def _saved(self, rows: np.ndarray, kind: str) -> str:
@@ -296,7 +294,7 @@ class Blocked(Field):
         sums = np.zeros((len(gaussians), NORMAL_SUMS))
         for number in range(len(task)):
             part = store.load(kind, number)
-            samples[part["numbers"]] = part["found"]
+            samples[part["numbers"]] = part["values"]
             sums[part["which"]] += part["sums"]
         rule = self.reader.rule
         return values_of(samples.reshape(-1, POINTS), sums, gaussians, rule.slope, rule.intercept)

@@ -173,10 +173,10 @@ class PointBlocks(Blockwise):
         points = np.load(self.points, mmap_mode="r")
         low, high = np.where(lo == 0, -np.inf, lo - 0.5), np.where(hi == self.grid.dims, np.inf, hi - 0.5)
         which = np.flatnonzero(((points >= low) & (points < high)).all(axis=1))
-        found = np.empty((0, 4))
+        normals = np.empty((0, 4))
         if len(which):
-            found = normals_in(self.box(number, LIT_HALO), points[which], np.array(self.grid.step))
-        self.store.save(self.kind, number, which=which, found=found)
+            normals = normals_in(self.box(number, LIT_HALO), points[which], np.array(self.grid.step))
+        self.store.save(self.kind, number, which=which, normals=normals)
 
 
 @dataclass(frozen=True)
@@ -203,7 +203,7 @@ class ValueBlocks(Blockwise):
         far = np.linalg.norm(rows[:, 3:].reshape(-1, 3, 3), axis=2) * reach()  # largest distance along each axis
         near = (rows[:, :3] + far >= lo - 0.5) & (rows[:, :3] - far < hi - 0.5)
         which = np.flatnonzero(near.all(axis=1))
-        found, numbers = np.empty(0, np.float32), np.empty(0, np.int64)
+        values, numbers = np.empty(0, np.float32), np.empty(0, np.int64)
         sums = np.zeros((len(which), NORMAL_SUMS))
         if len(which):
             box = self.box(number, LIT_HALO)
@@ -211,8 +211,8 @@ class ValueBlocks(Blockwise):
             where = some[:, :3].copy(), some[:, 3:].reshape(-1, 3, 3).copy()
             samples, sums = samples_of(box.voxels, *where, *part, np.array(self.grid.step))
             row, column = np.nonzero(np.isfinite(samples))
-            found, numbers = samples[row, column], which[row] * POINTS + column
-        self.store.save(self.kind, number, numbers=numbers, found=found, which=which, sums=sums)
+            values, numbers = samples[row, column], which[row] * POINTS + column
+        self.store.save(self.kind, number, numbers=numbers, values=values, which=which, sums=sums)
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,9 @@ from vvgt_cli.field.grid import Boxes
 from vvgt_cli.field.layered import Access, OpenedFile, content_of, open_content
 from vvgt_cli.field.reader import CLASSIFIED, VolumeOrigin
 from vvgt_cli.field.settings import shape_of
-from vvgt_cli.volume import ReadOptions, Statistics, Volume
+from vvgt_cli.volume import BINS, ReadOptions, Statistics, Volume, check_range, edges_of, integer_statistics
 from vvgt_cli.volume.blocks import Packed
 from vvgt_cli.volume.label_maps import MAX_LABELS, whole_numbers
-from vvgt_cli.volume.stats import BINS, check_range, edges_of, integer_statistics
 from vvgt_cli.volume.stored import read_block
 
 
@@ -60,27 +59,27 @@ class CountBlocks:
         places, weights = samples_in(self.boxes.dims, lo, hi)
         wanted = len(places) if self.limits is None else 0
         bricks = np.empty((wanted, *size[::-1]), volume.data.dtype.newbyteorder("="))
-        found: Tally | None = None
+        total: Tally | None = None
         unique = np.empty(0)
         for z in range(lo[2], hi[2], self.slices):
             begin, end = np.array([lo[0], lo[1], z]), np.array([hi[0], hi[1], min(z + self.slices, hi[2])])
             values = read_block(volume, begin, end)
             part = tally(values, volume, self.limits)
-            found = part if found is None else found.plus(part)
+            total = part if total is None else total.plus(part)
             if self.labels and len(unique) <= MAX_LABELS:
                 unique = np.union1d(unique, values[np.isfinite(values)])
             for n in range(wanted):
                 if z <= places[n, 2] < end[2]:
                     bricks[n] = _brick(volume, values, begin, end, places[n], size)
             del values  # free them before the next slices are read
-        assert found is not None, "a box has a slice"
+        assert total is not None, "a box has a slice"
         self.store.save(
             self.kind,
             number,
-            counts=found.counts,
-            ends=np.array([found.lo, found.hi, *found.stored]),
-            numbers=np.array([found.nan, found.finite], np.int64),
-            histogram=found.histogram,
+            counts=total.counts,
+            ends=np.array([total.lo, total.hi, *total.stored]),
+            numbers=np.array([total.nan, total.finite], np.int64),
+            histogram=total.histogram,
             samples=bricks,
             weights=weights,
             unique=unique,
@@ -100,13 +99,13 @@ class CountBlocks:
 
     def samples(self) -> tuple[np.ndarray, np.ndarray]:
         """Return sampled bricks (n, z, y, x) of stored values, and how many voxels (n,) each stands for."""
-        found = [self.store.load(self.kind, number, names=("samples", "weights")) for number in range(len(self))]
-        return np.concatenate([part["samples"] for part in found]), np.concatenate([part["weights"] for part in found])
+        parts = [self.store.load(self.kind, number, names=("samples", "weights")) for number in range(len(self))]
+        return np.concatenate([part["samples"] for part in parts]), np.concatenate([part["weights"] for part in parts])
 
     def unique(self) -> np.ndarray:
         """Return the distinct finite values (n,), ascending."""
-        found = [self.store.load(self.kind, number, names=("unique",))["unique"] for number in range(len(self))]
-        return np.unique(np.concatenate(found))
+        parts = [self.store.load(self.kind, number, names=("unique",))["unique"] for number in range(len(self))]
+        return np.unique(np.concatenate(parts))
 
 
 def _brick(
@@ -249,10 +248,10 @@ def tally(values: np.ndarray, volume: Volume, limits: tuple[float, float] | None
     if counted(volume):
         from vvgt_cli.volume.count_kernel import LANES, count_values
 
-        found = np.zeros((PARTS, LANES, 256**values.dtype.itemsize), np.int64)
+        counts = np.zeros((PARTS, LANES, 256**values.dtype.itemsize), np.int64)
         values.flags.writeable = False  # kernels are compiled for such
-        count_values(values.view(f"u{values.dtype.itemsize}"), found)
-        return Tally(found.sum(axis=(0, 1)))
+        count_values(values.view(f"u{values.dtype.itemsize}"), counts)
+        return Tally(counts.sum(axis=(0, 1)))
     values = values if values.dtype == np.float32 else values.astype(np.float64)
     values.flags.writeable = False
     return _range(values, volume) if limits is None else _binned(values, volume, limits)
@@ -276,9 +275,9 @@ def _binned(values: np.ndarray, volume: Volume, limits: tuple[float, float]) -> 
 
     edges = edges_of(*limits)
     lo, hi = float(edges[0]), float(edges[-1])
-    found = np.zeros((PARTS, LANES, BINS + 1), np.int64)
-    bin_values(values, volume.slope, volume.intercept, lo, hi, 1.0 if np.isfinite(hi - lo) else 0.5, found)
-    return Tally(np.empty(0, np.int64), histogram=found.sum(axis=(0, 1))[:BINS])
+    counts = np.zeros((PARTS, LANES, BINS + 1), np.int64)
+    bin_values(values, volume.slope, volume.intercept, lo, hi, 1.0 if np.isfinite(hi - lo) else 0.5, counts)
+    return Tally(np.empty(0, np.int64), histogram=counts.sum(axis=(0, 1))[:BINS])
 
 
 def with_limits(whole: Tally, volume: Volume) -> Tally:

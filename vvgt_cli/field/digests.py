@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.cameras import Camera
-from vvgt_cli.volume import Volume
-from vvgt_cli.volume.stats import slabs
+from vvgt_cli.volume import Volume, slabs
 from vvgt_cli.volume.stored import chunks_of, read_block
 
 AT_ONCE = 1 << 22  # voxels that are read at a time, or a row of chunks

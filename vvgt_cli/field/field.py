@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera
-from vvgt_cli.cameras.blocks import Blocks
+from vvgt_cli.cameras import Blocks, Camera
 from vvgt_cli.device import on_device
 from vvgt_cli.field.digests import digest, values_digest
 from vvgt_cli.field.source import StyledVolume
@@ -20,8 +19,7 @@ from vvgt_cli.progress import ProgressCallback
 
 if TYPE_CHECKING:
     from vvgt_cli.closed_form import Start, VbmOptions
-    from vvgt_cli.dvr import RenderSettings, Scene
-    from vvgt_cli.dvr.scene import PreparedVolume
+    from vvgt_cli.dvr import PreparedVolume, RenderSettings, Scene
 
 AT_ONCE = 1 << 17  # Gaussians whose samples are held in memory at a time
 
@@ -172,8 +170,8 @@ class Resident(Field):
         for k in range(0, len(gaussians), AT_ONCE):
             part = gaussians.take(np.arange(k, min(k + AT_ONCE, len(gaussians))))
             where = in_voxels(part, scene.half, scene.step)
-            found = samples_of(scene.voxels, *where, nothing, nothing, dims, scene.step)
-            values[k : k + len(part)] = values_of(*found, part, self.layout.slope, self.layout.intercept)
+            samples = samples_of(scene.voxels, *where, nothing, nothing, dims, scene.step)
+            values[k : k + len(part)] = values_of(*samples, part, self.layout.slope, self.layout.intercept)
         return values
 
     def with_look(self, source: StyledVolume) -> Resident:

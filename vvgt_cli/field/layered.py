@@ -216,8 +216,8 @@ def layers_of(
         if beside:
             warnings.warn(f"{opened.path}: {beside} may name its labels (try --labels {beside})", stacklevel=3)
         known = tissues(opened.path)
-        found = [_labelled(volume, labels, distance, access, known, empty=bool(whole)) for volume in maps]
-        return told_apart(found, set()) if opened.overlapping else found
+        tables = [_labelled(volume, labels, distance, access, known, empty=bool(whole)) for volume in maps]
+        return told_apart(tables, set()) if opened.overlapping else tables
     function = read_transfer_function(tf) if isinstance(tf, str) else tf
     sources = opened.classified
     stats = whole or [access.statistics(volume) for volume in sources]

@@ -180,10 +180,10 @@ def opened(
             field = Resident.of(source, device, run.console.message)
         yield field
         return
-    with store or store_beside(None) as blocks, blocked(run, request, options, blocks, needs) as found:
-        found.source = look(found.source)
-        run.compile(for_blocks(kernels(found.source, True)), found.source.kernel_type())
-        yield found
+    with store or store_beside(None) as blocks, blocked(run, request, options, blocks, needs) as in_blocks:
+        in_blocks.source = look(in_blocks.source)
+        run.compile(for_blocks(kernels(in_blocks.source, True)), in_blocks.source.kernel_type())
+        yield in_blocks
 
 
 def _measured(request: SourceRequest) -> tuple[Volume, int | None]:
@@ -400,5 +400,5 @@ def _facts(volume: Any) -> list[Any]:
     outer = [name for name in (volume, volume.rpartition(":/")[0], volume.partition("#")[0]) if name]
     files = next((some for name in outer if (some := files_of(name))), [])
     whole = [inner for file in files for inner in (file.rglob("*") if file.is_dir() else (file,))]
-    found = [file.stat() for file in whole]
-    return [volume, sum(f.st_size for f in found), max(f.st_mtime_ns for f in found)] if found else [volume]
+    stats = [file.stat() for file in whole]
+    return [volume, sum(f.st_size for f in stats), max(f.st_mtime_ns for f in stats)] if stats else [volume]

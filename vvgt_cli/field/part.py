@@ -6,8 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera
-from vvgt_cli.cameras.blocks import Blocks
+from vvgt_cli.cameras import Blocks, Camera
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.dvr.render import BoxFrame, RenderSettings, camera_arrays, for_thin, tiers
 from vvgt_cli.field.rays import HALO, LIT_HALO, LONGEST, KernelBundle, caster, meeting
@@ -109,8 +108,8 @@ class VolumePart:
         single = RenderSettings(step=LONGEST, samples=1)
         half = camera.resized(0.5)
         inner, outer = (self.view(half, single, grown=by) for by in (-grown, grown))
-        found: np.ndarray = self.shown(half) * (1 - np.abs(outer - inner).max(axis=2))
-        return found.repeat(2, axis=0).repeat(2, axis=1)
+        weights: np.ndarray = self.shown(half) * (1 - np.abs(outer - inner).max(axis=2))
+        return weights.repeat(2, axis=0).repeat(2, axis=1)
 
     def _before(self, eye: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Yield boxes of voxels (first, end) that rays from an eye, in voxels, may pass before they enter the part.

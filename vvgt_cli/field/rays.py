@@ -100,14 +100,14 @@ class KernelBundle(NamedTuple):
 @lru_cache(maxsize=2)
 def _read(path: str) -> list[KernelBundle]:
     try:
-        with np.load(path) as found:
+        with np.load(path) as arrays:
             out = []
-            for k in range(len(found.files) // 3):
-                numbers = found[f"camera{k}"]
-                pixels = np.ascontiguousarray(found[f"pixels{k}"], np.int64)
+            for k in range(len(arrays.files) // 3):
+                numbers = arrays[f"camera{k}"]
+                pixels = np.ascontiguousarray(arrays[f"pixels{k}"], np.int64)
                 basis = np.ascontiguousarray(numbers[3:12].reshape(3, 3))
                 out.append(
-                    KernelBundle(numbers[:3], basis, numbers[12:16], float(numbers[16]), pixels, found[f"offsets{k}"])
+                    KernelBundle(numbers[:3], basis, numbers[12:16], float(numbers[16]), pixels, arrays[f"offsets{k}"])
                 )
             return out
     except Exception as error:  # zipfile and numpy raise many types
@@ -130,14 +130,14 @@ def save_rays(
     pieces, halo, kind = pieces_of(blocks.dims), HALO if light is None else LIT_HALO, rays.kind
     lo, hi = blocks.at(number)
     table: list[tuple[int, int, int]] = []  # piece, bundle, rays
-    found: list[np.ndarray] = []
+    results: list[np.ndarray] = []
     for piece in _within(pieces, lo, hi):
         first, last = pieces.at(piece)
         for k, seen in _piece_rays(rays, block.part(first - halo, last + halo), first, last, blocks.dims, light):
             table.append((piece, k, len(seen)))
-            found.append(seen)
+            results.append(seen)
     with atomic_write(store.path(kind, number, SUFFIX), overwrite=True) as temporary, open(temporary, "wb") as stream:
-        np.save(stream, np.concatenate(found) if found else np.empty(0, RAY))
+        np.save(stream, np.concatenate(results) if results else np.empty(0, RAY))
     store.save(kind, number, table=np.array(table, np.int64).reshape(-1, 3))
 
 
@@ -248,15 +248,15 @@ def composed(
             offset += count
         if offset:
             mapped[number] = _mapped(path, offset)
-    for bundle, found in zip(bundles, shown, strict=True):
+    for bundle, parts in zip(bundles, shown, strict=True):
         each = len(bundle.offsets)
         color, through = np.zeros((len(bundle.pixels) * each, 3)), np.ones(len(bundle.pixels) * each)
-        for piece in front_to_back(pieces, bundle.eye, list(found)):
-            number, part = found[piece]
+        for piece in front_to_back(pieces, bundle.eye, list(parts)):
+            number, part = parts[piece]
             ray, rgba = mapped[number]["ray"][part], mapped[number]["rgba"][part]
             color[ray] += through[ray, None] * rgba[:, :3]
             through[ray] *= 1.0 - rgba[:, 3]
-        for number in {number for number, _ in found.values()}:
+        for number in {number for number, _ in parts.values()}:
             give_back(mapped[number])
         yield np.concatenate([color, 1 - through[:, None]], axis=1).reshape(-1, each, 4)
 
@@ -264,10 +264,10 @@ def composed(
 def _mapped(path: os.PathLike[str], count: int) -> np.ndarray:
     """Return the rays of a result, memory-mapped."""
     try:
-        found: np.ndarray = np.load(path, mmap_mode="r")
-        if found.dtype == RAY and len(found) == count:
-            return found
-        error: object = f"{len(found)} rays for {count}"
+        rays: np.ndarray = np.load(path, mmap_mode="r")
+        if rays.dtype == RAY and len(rays) == count:
+            return rays
+        error: object = f"{len(rays)} rays for {count}"
     except (OSError, ValueError, EOFError) as problem:
         error = problem
     raise DataError(f"{path}: damaged ({error}); remove the block's files and run the same command again")

@@ -14,9 +14,8 @@ from vvgt_cli.dvr.layout import Texels, Voxels
 from vvgt_cli.dvr.scene import KernelRule
 from vvgt_cli.field.layered import OpenedFile, content_of, open_content
 from vvgt_cli.look.tables import Optics
-from vvgt_cli.volume import ReadOptions, Volume
+from vvgt_cli.volume import ReadOptions, Volume, triple
 from vvgt_cli.volume.stored import read_block
-from vvgt_cli.volume.types import triple
 
 OPEN = 16  # files that a process keeps open
 FEW_SAMPLES = 512  # bricks of layers, each of which is read separately
@@ -165,11 +164,11 @@ class Layers:
     @cached_property
     def _opened(self) -> list[Layer]:
         """The layers with their volumes."""
-        found = []
+        layers = []
         for layer, places in zip(self.layers, self.places, strict=True):
             volume, *colors = [place.volume() for place in places]
-            found.append(replace(layer, volume=volume, colors=triple(colors) if colors else None))
-        return found
+            layers.append(replace(layer, volume=volume, colors=triple(colors) if colors else None))
+        return layers
 
     def box(self, lo: np.ndarray, hi: np.ndarray) -> VoxelBox:
         """Implement `Scalars.box`."""

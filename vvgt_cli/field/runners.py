@@ -285,11 +285,11 @@ class DaskRunner(Runner):
             before: set[str] = set()
             left = TRIES * self.workers
             while not closed.wait(AGAIN):
-                found, none_left = jobs_gone(cluster)
+                ended, none_left = jobs_gone(cluster)
                 if closed.is_set() or self._client is None:
                     continue
-                gone = {name: job for name, job in found.items() if job in before}  # not one that has only just ended
-                before = set(found.values())
+                gone = {name: job for name, job in ended.items() if job in before}  # not one that has only just ended
+                before = set(ended.values())
                 if gone and none_left:
                     self._lost = (
                         "--scheduler slurm: all jobs ended before all blocks were done; see their output "

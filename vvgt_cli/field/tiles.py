@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vvgt_cli.cameras import default_views
-from vvgt_cli.cameras.sets import pixel_width
+from vvgt_cli.cameras import default_views, pixel_width
 from vvgt_cli.closed_form.columns import COLUMNS, MASS, MOMENTS, SEEN
 from vvgt_cli.closed_form.lit import SEEN_LITTLE, Shading, base_rows
 from vvgt_cli.closed_form.moments import Cells, morton
@@ -173,14 +172,14 @@ class TiledPyramid(Pyramid):
         Raises:
             DataError: a block's file is missing or damaged.
         """
-        found: dict[int, tuple[Any, ...]] = {}
+        tiles: dict[int, tuple[Any, ...]] = {}
         for number in self.blocks:
             part, offset = self.store.load(TREES, number), 0
             for k, (row, (size, base)) in enumerate(zip(part["which"].tolist(), part["sizes"].tolist(), strict=True)):
-                found[row] = (size, base, offset), *(part[name][k] for name in ("moments", "largest", "shades"))
+                tiles[row] = (size, base, offset), *(part[name][k] for name in ("moments", "largest", "shades"))
                 offset += 16 * size
-        sizes, *columns = ([found[row][k] for row in sorted(found)] for k in range(4))
-        return [self.places[row] for row in sorted(found)], sizes, tuple(map(np.array, columns))
+        sizes, *columns = ([tiles[row][k] for row in sorted(tiles)] for k in range(4))
+        return [self.places[row] for row in sorted(tiles)], sizes, tuple(map(np.array, columns))
 
     @property
     def base(self) -> int:
@@ -225,10 +224,10 @@ class TiledPyramid(Pyramid):
         nodes = np.flatnonzero(self.scores_over_tiles().leaves(threshold)) + len(self)
         if not len(nodes):
             return None
-        found, moments, shades = leaves_of(self.top, nodes), self.top.moments, self._saved[2][2]
+        leaves, moments, shades = leaves_of(self.top, nodes), self.top.moments, self._saved[2][2]
         if self.shading is None:
-            return found
+            return leaves
         seen = np.maximum(moments[:, SEEN], SEEN_LITTLE * moments[:, MASS])
         pairs = zip(*base_rows(self.top, nodes), strict=True)
         means = [np.average(shades[a:b], axis=0, weights=seen[a:b]) for a, b in pairs]
-        return replace(found, moments=np.concatenate([found.moments, means], axis=1))
+        return replace(leaves, moments=np.concatenate([leaves.moments, means], axis=1))

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.cameras.quaternions import quaternions as quaternions_of
+from vvgt_cli.cameras.types import quaternions as quaternions_of
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians.live_facts import AXIS, GRADIENT
 from vvgt_cli.gaussians.types import HARMONICS, Gaussians
@@ -222,8 +222,8 @@ def directions(means: np.ndarray, eye: np.ndarray) -> tuple[np.ndarray, np.ndarr
 def basis(directions: np.ndarray, degree: int) -> np.ndarray:
     """Return the harmonics (K, M) of degree 1 to ``degree`` at unit directions (K, 3)."""
     d = np.asarray(directions, np.float64)
-    found: np.ndarray = np.stack(terms(*d.T), axis=-1)[:, : HARMONICS[degree]]
-    return found
+    harmonics: np.ndarray = np.stack(terms(*d.T), axis=-1)[:, : HARMONICS[degree]]
+    return harmonics
 
 
 def view_colors(gaussians: Gaussians, eye: np.ndarray) -> np.ndarray:
@@ -246,8 +246,8 @@ def turned(gaussians: Gaussians, matrix: np.ndarray) -> np.ndarray | None:
         return None
     left, _, right = np.linalg.svd(np.asarray(matrix, np.float64))
     mixed = np.einsum("nm,kmc->knc", mixing(left @ right, gaussians.degree), gaussians.harmonics.astype(np.float64))
-    found: np.ndarray = np.clip(mixed, -_LARGEST, _LARGEST).astype(np.float32)
-    return found
+    limited: np.ndarray = np.clip(mixed, -_LARGEST, _LARGEST).astype(np.float32)
+    return limited
 
 
 def mixing(matrix: np.ndarray, degree: int) -> np.ndarray:

@@ -14,9 +14,7 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians.frames import up_matrix
 from vvgt_cli.gaussians.live_facts import WORD, LiveFacts, live_facts, one_comment
 from vvgt_cli.gaussians.types import HARMONICS
-from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.look.labels import LabelTable, hex_color, labels_legend
-from vvgt_cli.look.lighting import Lighting, parse_lighting
+from vvgt_cli.look import LabelTable, Lighting, TransferFunction, hex_color, labels_legend, parse_lighting
 from vvgt_cli.version import VERSION
 
 REST_COUNTS = {3 * terms: degree for degree, terms in HARMONICS.items()}  # f_rest properties: 0, 9, 24, 45
@@ -196,7 +194,7 @@ def facts_in(comments: list[str], name: str, columns: Sequence[str] = ()) -> dic
     Raises:
         DataError: a comment begins with "vvgt" and is not valid.
     """
-    found: dict[str, Any] = {}
+    facts: dict[str, Any] = {}
     lives: list[dict[str, Any]] = [{}]
     for comment in comments:
         ours, word, text = [*comment.split(None, 2), "", "", ""][:3]
@@ -210,14 +208,14 @@ def facts_in(comments: list[str], name: str, columns: Sequence[str] = ()) -> dic
                 live = lives[-1]
                 live |= more | {"labels": live.get("labels", ()) + more["labels"]} if "labels" in more else more
             elif word == CERTIFICATE:
-                found[CERTIFICATE] = Certificate.of(text)
+                facts[CERTIFICATE] = Certificate.of(text)
             else:
-                found |= _one_comment(word, text)
+                facts |= _one_comment(word, text)
         except (ValueError, IndexError, UsageError):
             raise DataError(f"{name}: comment {comment[:80]!r}; expected one that vvgt writes") from None
-    if found.get("frame") == "world" and "scale" not in found:
+    if facts.get("frame") == "world" and "scale" not in facts:
         raise DataError(f"{name}: in world space without scale and centre; expected both in its comments")
-    return found | {"live": live_facts(lives, list(columns))}
+    return facts | {"live": live_facts(lives, list(columns))}
 
 
 def _one_comment(word: str, text: str) -> dict[str, Any]:
@@ -347,8 +345,8 @@ def legend_text(tf: object, lo: float, hi: float, unit: str, quantity: str = "")
 
 def checked(text: str) -> str:
     """Check that a text is a legend, and return it; raise ValueError for others."""
-    found = json.loads(text)
-    if not isinstance(found, dict) or not ("nodes" in found or "labels" in found):
+    legend = json.loads(text)
+    if not isinstance(legend, dict) or not ("nodes" in legend or "labels" in legend):
         raise ValueError(text)
     return text
 
@@ -396,8 +394,8 @@ class Certificate:
 
     def facts(self) -> dict[str, Any]:
         """Return the known values by name."""
-        found = vars(self) | {"conditions": dict(self.conditions)}
-        return {key: value for key, value in found.items() if value not in (None, {})}
+        values = vars(self) | {"conditions": dict(self.conditions)}
+        return {key: value for key, value in values.items() if value not in (None, {})}
 
     def line(self) -> str:
         """Return the header comment, one line of ASCII without the word "comment"."""
@@ -406,11 +404,11 @@ class Certificate:
     @classmethod
     def of(cls, text: str) -> Certificate:
         """Parse the JSON that `line` writes after its keyword, or raise ValueError."""
-        found = json.loads(text)
-        if not isinstance(found, dict) or not isinstance(found.get("conditions", {}), dict):
+        values = json.loads(text)
+        if not isinstance(values, dict) or not isinstance(values.get("conditions", {}), dict):
             raise ValueError(text)
-        conditions = tuple((str(name), _number(value)) for name, value in found.pop("conditions", {}).items())
-        woven = found.pop("texture", None)
+        conditions = tuple((str(name), _number(value)) for name, value in values.pop("conditions", {}).items())
+        woven = values.pop("texture", None)
         if woven is not None and (not isinstance(woven, list) or len(woven) != 2):
             raise ValueError(text)
         texture = None if woven is None else (_number(woven[0]), _number(woven[1]))
@@ -419,15 +417,15 @@ class Certificate:
             "pixels": int, "live_psnr": float, "position_error": float, "values_psnr": float, "values_error": float,
             "command": str,
         }  # fmt: skip
-        if not {"volume", "look", "size", "rule", "psnr", "views", "pixels"} <= set(found) <= set(kinds):
+        if not {"volume", "look", "size", "rule", "psnr", "views", "pixels"} <= set(values) <= set(kinds):
             raise ValueError(text)
         known: dict[str, Any] = {"sha256": None, "texture": texture}
-        for key, value in found.items():
+        for key, value in values.items():
             kind = kinds[key]
-            found[key] = _number(value) if kind is float else value
-            if not isinstance(found[key], kind) or isinstance(value, bool):
+            values[key] = _number(value) if kind is float else value
+            if not isinstance(values[key], kind) or isinstance(value, bool):
                 raise ValueError(text)
-        return cls(**(known | found), conditions=conditions)
+        return cls(**(known | values), conditions=conditions)
 
 
 def _number(value: Any) -> float:

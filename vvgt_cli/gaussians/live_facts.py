@@ -11,13 +11,11 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, NoLiveForm
-from vvgt_cli.look.convert import to_text
-from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
-from vvgt_cli.look.labels import Label, LabelTable, merge_labels
+from vvgt_cli.look import ColorMap, Label, LabelTable, PiecewiseOpacity, TransferFunction, merge_labels
 from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.look.resolve import unit_of_values
-from vvgt_cli.volume import Statistics, Volume
-from vvgt_cli.volume.stats import BINS, edges_of
+from vvgt_cli.look.to_json import to_text
+from vvgt_cli.volume import BINS, Statistics, Volume, edges_of
 
 COLUMNS = ("value", "spread", "length", "axis_x", "axis_y", "axis_z")
 NXYZ, LABEL, LAYER = ("nx", "ny", "nz"), "label", "layer"

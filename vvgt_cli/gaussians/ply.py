@@ -169,12 +169,12 @@ def _numbers(facts: LiveFacts) -> list[tuple[str, str, str, int]]:
 
     The row of a label takes one byte, or two for more than 256 labels; the number of a layer takes one.
     """
-    labels, found = facts.most_labels, []
+    labels, columns = facts.most_labels, []
     if labels:
-        found.append((LABEL, *(("uchar", "u1") if labels <= 256 else ("ushort", "<u2")), LABEL_ROW))
+        columns.append((LABEL, *(("uchar", "u1") if labels <= 256 else ("ushort", "<u2")), LABEL_ROW))
     if facts.others:
-        found.append((LAYER, "uchar", "u1", LAYER_ID))
-    return found
+        columns.append((LAYER, "uchar", "u1", LAYER_ID))
+    return columns
 
 
 def ply_header(count: int, degree: int, options: PlyOptions, live: bool = False) -> bytes:
@@ -258,8 +258,8 @@ def _drawable(rows: np.ndarray, header: PlyHeader, name: str) -> np.ndarray:
     kept = np.logical_and.reduce([*map(np.isfinite, values), rotated, opaque | np.isfinite(rows["opacity"])])
     if kept.all() and not opaque.any():
         return rows
-    found = {"skipped (a value not finite, or rotation 0)": ~kept, "read as opaque (opacity inf)": opaque & kept}
-    counts = [f"{count} {what}" for what, these in found.items() if (count := np.count_nonzero(these))]
+    unusual = {"skipped (a value not finite, or rotation 0)": ~kept, "read as opaque (opacity inf)": opaque & kept}
+    counts = [f"{count} {what}" for what, these in unusual.items() if (count := np.count_nonzero(these))]
     warnings.warn(f"{name}: of {len(kept)} Gaussians {', '.join(counts)}", stacklevel=3)
     rows = rows[kept]
     rows["opacity"][opaque[kept]] = OPAQUE
@@ -277,20 +277,20 @@ def _values(header: PlyHeader, columns: Callable[..., np.ndarray]) -> np.ndarray
     if header.live is None:
         return None
     facts, numbers = header.live, _numbers(header.live)
-    found = columns(*COLUMNS, *NXYZ, *(name for name, *_ in numbers))
+    values = columns(*COLUMNS, *NXYZ, *(name for name, *_ in numbers))
     if facts.others and not facts.most_labels:
-        found = np.insert(found, LABEL_ROW, 0, axis=1)
-    layer = found[:, LAYER_ID].astype(np.int64) if facts.others else np.zeros(len(found), np.int64)
+        values = np.insert(values, LABEL_ROW, 0, axis=1)
+    layer = values[:, LAYER_ID].astype(np.int64) if facts.others else np.zeros(len(values), np.int64)
     if layer.max(initial=0) >= len(facts.layers):
         raise DataError(f"layer number {layer.max()}; expected less than {len(facts.layers)}")
     if facts.most_labels:
         most = np.array([len(one.labels) or 1 for one in facts.layers])[layer]
-        wrong = np.flatnonzero(found[:, LABEL_ROW] >= most)
+        wrong = np.flatnonzero(values[:, LABEL_ROW] >= most)
         if len(wrong):
-            raise DataError(f"label row {found[wrong[0], LABEL_ROW]:g}; expected less than {most[wrong[0]]}")
-    if (found[:, 1] < 0).any() or (found[:, 2] <= 0).any():
+            raise DataError(f"label row {values[wrong[0], LABEL_ROW]:g}; expected less than {most[wrong[0]]}")
+    if (values[:, 1] < 0).any() or (values[:, 2] <= 0).any():
         raise DataError("negative spreads, or lengths that are not positive; expected the columns that vvgt writes")
-    return found
+    return values
 
 
 def _check_rotations(gaussians: Gaussians, name: str) -> None:
@@ -306,11 +306,6 @@ def in_unit_frame(gaussians: Gaussians, header: PlyHeader) -> Gaussians:
         shift = up_matrix(header.up) @ np.array(header.centre)
         gaussians = rescale(gaussians, header.scale, -shift, np.zeros(3))
     return turn(gaussians, header.up, inverse=True)
-
-
-def opacity(gaussians: Gaussians) -> np.ndarray:
-    """Return the peak alpha (K,) float64 from the logits."""
-    return 1 / (1 + np.exp(-np.clip(gaussians.opacity_logits.astype(np.float64), -700, 700)))
 
 
 def live_summary(gaussians: Gaussians, facts: LiveFacts) -> dict[str, object]:
@@ -329,10 +324,10 @@ def live_summary(gaussians: Gaussians, facts: LiveFacts) -> dict[str, object]:
         counts = np.bincount(gaussians.live[:, LABEL_ROW].astype(np.int64), minlength=len(facts.labels)).tolist()
         rows = zip(facts.labels, counts, strict=True)
         return {"live_labels": [{"label": e.number, "name": e.name, "gaussians": n} for e, n in rows]}
-    found: dict[str, object] = {"live_values": [facts.lo, facts.hi], "live_unit": facts.unit or "none"}
+    summary: dict[str, object] = {"live_values": [facts.lo, facts.hi], "live_unit": facts.unit or "none"}
     for column, name in enumerate(COLUMNS[:3]):
-        found[f"live_{name}"] = [float(f"{q:.6g}") for q in np.percentile(gaussians.live[:, column], (0, 50, 100))]
-    return found | {"live_function": facts.baked().get("name", "")}
+        summary[f"live_{name}"] = [float(f"{q:.6g}") for q in np.percentile(gaussians.live[:, column], (0, 50, 100))]
+    return summary | {"live_function": facts.baked().get("name", "")}
 
 
 def describe(gaussians: Gaussians, header: PlyHeader) -> dict[str, object]:
@@ -356,7 +351,7 @@ def describe(gaussians: Gaussians, header: PlyHeader) -> dict[str, object]:
     }
     if len(gaussians):
         sigma = np.exp(np.clip(gaussians.log_scales.astype(np.float64), -700, 700))
-        for key, values in (("sigma", sigma), ("opacity", opacity(gaussians))):
+        for key, values in (("sigma", sigma), ("opacity", gaussians.opacity)):
             summary[key] = [float(f"{q:.6g}") for q in np.percentile(values, (0, 50, 100))]
         summary["box_min"] = [float(v) for v in gaussians.means.min(axis=0)]
         summary["box_max"] = [float(v) for v in gaussians.means.max(axis=0)]

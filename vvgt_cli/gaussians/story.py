@@ -1,4 +1,4 @@
-"""Stories of pages: steps of a text with what is seen then (docs/live.md, "Stories"), shown by `page/story.mjs`."""
+"""Stories of pages: steps of a text with what is seen then (docs/page.md, "Stories"), shown by `page/story.mjs`."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.files import read_text
-from vvgt_cli.look.labels import LabelTable
-from vvgt_cli.look.lighting import MAX_LIGHT
+from vvgt_cli.look import MAX_LIGHT, LabelTable
 from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.look.readers.names import names
 from vvgt_cli.volume.components import listed
@@ -57,7 +56,7 @@ class Story:
         Raises:
             DataError: a step shows what the page does not have.
         """
-        found = []
+        steps = []
         for k, step in enumerate(self.steps, 1):
             where = f"{self.what}, step {k}"
             if frames is not None and step.get("frame", 0) >= frames:
@@ -67,15 +66,15 @@ class Story:
             if used and (not layers or len(whole) < len(layers)):
                 keys = ", ".join(key for key in KEYS if key not in LOOK)
                 raise DataError(f"{where}: {used[0]!r} needs a page with values of one volume; expected {keys}")
-            found.append(_resolved(step, whole, where) if used else step)
-        return replace(self, steps=tuple(found))
+            steps.append(_resolved(step, whole, where) if used else step)
+        return replace(self, steps=tuple(steps))
 
 
 def read_story(given: StoryLike) -> Story:
     """Return the story of a ``story.json`` or of its content: a step keeps what the one before it states.
 
     Raises:
-        DataError: no file, no JSON, or not in the form of docs/live.md.
+        DataError: no file, no JSON, or not in the form of docs/page.md.
     """
     what, parsed = "story", given
     if not isinstance(given, Mapping):
@@ -90,13 +89,13 @@ def read_story(given: StoryLike) -> Story:
     if not isinstance(steps, list | tuple) or not 0 < len(steps) <= MOST:
         raise DataError(f"{what}: expected 'steps', a list of 1 to {MOST} steps")
     now: dict[str, Any] = {}
-    found = []
+    told = []
     for k, step in enumerate(steps, 1):
         _check(step, f"{what}, step {k}")
         fresh = len(step) > 1 and ("link" in step or "link" in now)
         now = {key: value for key, value in (({} if fresh else now) | step).items() if value is not None}
-        found.append(now)
-    return Story(what, tuple(found))
+        told.append(now)
+    return Story(what, tuple(told))
 
 
 def _short(value: Any) -> str:
@@ -269,8 +268,8 @@ def _resolved(step: dict[str, Any], layers: Sequence[Layer], where: str) -> dict
 def _numbered(one: Mapping[str, Any], table: LabelTable, where: str) -> dict[str, Any]:
     """Return a label's entry by its number."""
     key = "name" if "name" in one else "number"
-    found = [label.number for label in table.structures if getattr(label, key) == one[key]]
-    if not found:
+    numbers = [label.number for label in table.structures if getattr(label, key) == one[key]]
+    if not numbers:
         known = listed([str(getattr(label, key)) for label in table.structures], ", ", 8)
         raise DataError(f"{where}: no label {one[key]!r}; expected one of {known}")
-    return {"number": found[0]} | {part: one[part] for part in ("opacity", "color") if part in one}
+    return {"number": numbers[0]} | {part: one[part] for part in ("opacity", "color") if part in one}

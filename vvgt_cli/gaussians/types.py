@@ -70,10 +70,15 @@ class Gaussians:
         terms = 0 if self.harmonics is None else self.harmonics.shape[1]
         return next(degree for degree, count in HARMONICS.items() if count == terms)
 
+    @property
+    def opacity(self) -> np.ndarray:
+        """Peak alpha (K,) float64."""
+        return 1 / (1 + np.exp(-np.clip(self.opacity_logits.astype(np.float64), -700, 700)))
+
     def arrays(self) -> dict[str, np.ndarray]:
         """Return every array that is present, by name, in the order of the fields."""
-        found = {field: getattr(self, field) for field in (*_WIDTHS, "harmonics", "live")}
-        return {field: array for field, array in found.items() if array is not None}
+        columns = {field: getattr(self, field) for field in (*_WIDTHS, "harmonics", "live")}
+        return {field: array for field, array in columns.items() if array is not None}
 
     def take(self, index: np.ndarray) -> Gaussians:
         """Return the subset or permutation that ``index`` selects."""

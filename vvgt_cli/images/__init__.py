@@ -3,14 +3,5 @@
 from vvgt_cli.images.compose import captioned, contact_sheet, over, side_by_side
 from vvgt_cli.images.files import png_bytes, read_exr, read_png, write_exr, write_png
 
-__all__ = [
-    "captioned",
-    "contact_sheet",
-    "over",
-    "png_bytes",
-    "read_exr",
-    "read_png",
-    "side_by_side",
-    "write_exr",
-    "write_png",
-]
+__all__ = ["captioned", "contact_sheet", "over", "png_bytes", "read_exr"]
+__all__ += ["read_png", "side_by_side", "write_exr", "write_png"]

@@ -198,11 +198,11 @@ def score_view(reference: np.ndarray, ours: np.ndarray, *, perceptual: bool = Tr
         "_alpha": (reference[..., 3], ours[..., 3]),
     }
     seen = reference[..., 3] > FOREGROUND
-    found: dict[str, Any] = {}
+    scores: dict[str, Any] = {}
     for name, pair in pairs.items():
-        found |= {f"psnr{name}": psnr(*pair), f"psnr{name}_foreground": psnr(*pair, seen) if seen.any() else None}
+        scores |= {f"psnr{name}": psnr(*pair), f"psnr{name}_foreground": psnr(*pair, seen) if seen.any() else None}
     return ViewScore(
-        **found,
+        **scores,
         ssim=ssim(*pairs[""]) if perceptual and min(seen.shape) > 2 * RADIUS else None,
         flip=flip(*pairs[""]) if perceptual else None,
     )
@@ -255,14 +255,14 @@ def texture(pairs: Iterable[tuple[np.ndarray, np.ndarray]]) -> Texture:
 
     Raise DataError for other shapes.
     """
-    found = [np.empty((2, 0))]
+    blocks = [np.empty((2, 0))]
     for reference, ours in pairs:
         if reference.shape != ours.shape or reference.ndim != 3 or reference.shape[2] != 4:
             raise DataError(f"views of shape {reference.shape} and {ours.shape}; expected the same (h, w, 4)")
         if min(reference.shape[:2]) >= BLOCK:
             both = np.stack([_blocks(np.square(band(i))).mean(axis=(1, 3, 4)) ** 0.5 for i in (reference, ours)])
-            found.append(both[:, (_blocks(reference[..., 3]).min(axis=(1, 3)) > OPAQUE) & (both[0] < SMOOTH)])
-    theirs, own = np.concatenate([both.astype(np.float32) for both in found], axis=1)
+            blocks.append(both[:, (_blocks(reference[..., 3]).min(axis=(1, 3)) > OPAQUE) & (both[0] < SMOOTH)])
+    theirs, own = np.concatenate([both.astype(np.float32) for both in blocks], axis=1)
     if not len(own):
         return Texture(0, None, None, None, None)
     worst = max(round(WORST * len(own)), 1)

@@ -19,11 +19,11 @@ def command() -> list[str]:
     """Return the words that start ``vvgt``, of the variable VVGT or its place in PATH, or raise RuntimeError."""
     given = os.environ.get("VVGT")
     whole = shutil.which(given or "vvgt")  # a path may hold spaces and backslashes
-    found = [whole] if whole else shlex.split(given or "")
-    if not found or shutil.which(found[0]) is None:
+    words = [whole] if whole else shlex.split(given or "")
+    if not words or shutil.which(words[0]) is None:
         what = f"VVGT={given}: no such program" if given else "vvgt: not in PATH"
         raise RuntimeError(f"{what}; install it (pip install vvgt) or set VVGT to its path, as /opt/venv/bin/vvgt")
-    return found
+    return words
 
 
 def run(arguments: Sequence[str], say: Callable[[str], object] = print) -> None:

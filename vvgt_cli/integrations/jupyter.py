@@ -18,7 +18,7 @@ import traitlets
 
 from vvgt_cli.gaussians.formats.page_file import iframe
 
-# the page's messages (docs/live.md, "In a site"): what it says becomes the traits, and what Python sets is sent to it
+# the page's messages (docs/page.md, "In a site"): what it says becomes the traits, and what Python sets is sent to it
 SCRIPT = """
 const keys = ['camera', 'cut', 'light', 'function', 'labels'];
 export default { render({ model, el }) {

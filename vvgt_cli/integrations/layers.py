@@ -15,8 +15,7 @@ from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.field.layered import OpenedFile
 from vvgt_cli.library.inputs import LightLike, Look, source_of
 from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction
-from vvgt_cli.volume import Volume
-from vvgt_cli.volume.types import triple
+from vvgt_cli.volume import Volume, triple
 
 FINER = 8  # times as fine as the first volume a layer may be
 SLACK = 1e-3  # voxels

@@ -73,8 +73,8 @@ def frames(volume: Any, steps: bool) -> list[Any]:
     """Return a volume node for each step of the sequence that ``volume`` is a proxy of, else ``volume`` alone."""
     scene, kind = volume.GetScene(), "vtkMRMLSequenceBrowserNode"
     browsers = [scene.GetNthNodeByClass(k, kind) for k in range(scene.GetNumberOfNodesByClass(kind) if steps else 0)]
-    found = next((s for browser in browsers if (s := browser.GetSequenceNode(volume)) is not None), None)
-    return [volume] if found is None else [found.GetNthDataNode(k) for k in range(found.GetNumberOfDataNodes())]
+    node = next((s for browser in browsers if (s := browser.GetSequenceNode(volume)) is not None), None)
+    return [volume] if node is None else [node.GetNthDataNode(k) for k in range(node.GetNumberOfDataNodes())]
 
 
 def _world(node: Any) -> Any:

@@ -54,18 +54,18 @@ def write(path: str, layers: Sequence[tuple[Any, dict[str, Any], str]]) -> list[
         said.append("napari's 3D view is a mirror image of x, y, z (its depth points to you); the file is not mirrored")
     with warnings.catch_warnings(record=True) as heard:
         warnings.simplefilter("always")
-        found = [_converted(shown, step) for step in range(steps)]
+        results = [_converted(shown, step) for step in range(steps)]
     for text in dict.fromkeys([*said, *(str(one.message) for one in heard if one.category is UserWarning)]):
         if window is None:
             warnings.warn(text, stacklevel=2)
         else:  # its dialog keeps Python's warnings to itself
             show_warning(text)
     if steps == 1:
-        found[0].save(path)
+        results[0].save(path)
         return [path]
     clouds = [
         Cloud(one.gaussians, one.report, one.ply, f"{k}", f"{k:04d}", {"frame": k}, one.normals())
-        for k, one in enumerate(found)
+        for k, one in enumerate(results)
     ]
     suffix = Path(path).suffix
     pattern = path if suffix == ".html" else f"{path.removesuffix(suffix)}_{{:04d}}{suffix}"
@@ -92,7 +92,7 @@ def _lost(layer: Any, layered: bool) -> list[str]:
         "clipping planes": any(plane.enabled for plane in layer.experimental_clipping_planes),
         "colour of NaN (clear instead)": hasattr(layer.colormap, "nan_color") and bool(layer.colormap.nan_color[3]),
     }
-    return [note for note, found in lost.items() if found]
+    return [note for note, applies in lost.items() if applies]
 
 
 def _values(layer: Any) -> Any:

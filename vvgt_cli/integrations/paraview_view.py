@@ -54,12 +54,12 @@ def look(source: Any, options: dict[str, Any], function: str) -> tuple[list[str]
         words += ["--tf", options["Function"]]
     if shown is not None:
         volume, more = _volume(shown)
-        found = drawn(volume, source.GetOutputDataObject(0))
+        seen = drawn(volume, source.GetOutputDataObject(0))
         matrix = [volume.GetMatrix().GetElement(k // 4, k % 4) for k in range(16)]
-        notes += more + found.notes + ["clipping planes"] * (found.mask is not None)
+        notes += more + seen.notes + ["clipping planes"] * (seen.mask is not None)
         words += _array(shown)
         if not options["Function"] and volume.GetProperty().GetRGBTransferFunction(0) and shown.ColorArrayName[1]:
-            made, more = property_json(volume.GetProperty(), 0, found.scale)
+            made, more = property_json(volume.GetProperty(), 0, seen.scale)
             notes += more
             shaded = bool(volume.GetProperty().GetShade())
             words += ["--tf", function]

@@ -21,8 +21,7 @@ from vvgt_cli.integrations.vtk_property import property_json
 from vvgt_cli.integrations.vtk_scene import Drawn, drawn
 from vvgt_cli.integrations.vtk_view import camera_of, lights_of, volumes_of
 from vvgt_cli.library.inputs import Look, Reading, volume_of
-from vvgt_cli.look import read_transfer_function
-from vvgt_cli.look.lighting import LightOptions
+from vvgt_cli.look import LightOptions, read_transfer_function
 
 COEFFICIENTS = ("ambient", "diffuse", "specular", "specular_power")
 
@@ -48,10 +47,10 @@ def export_plotter(plotter: Any, path: str | os.PathLike[str], *, overwrite: boo
         raise UsageError("plotter: shows no volume; call plotter.add_volume(...) first")
     layers, notes, shaded = [], _others(renderer), [v.GetProperty() for v in shown if v.GetProperty().GetShade()]
     for volume in shown:
-        found = drawn(volume)
-        more, about = _layers(found, volume.GetProperty())
+        seen = drawn(volume)
+        more, about = _layers(seen, volume.GetProperty())
         layers += more
-        notes += found.notes + about
+        notes += seen.notes + about
     lights, unlike = lights_of(renderer) if shaded else (["none"], [])
     if 0 < len(shaded) < len(shown):
         notes.append("volumes without shading beside shaded ones")
@@ -81,27 +80,27 @@ def _others(renderer: Any) -> list[str]:
     return [f"{count} surface{'s' * (count > 1)}"] if count else []
 
 
-def _layers(found: Drawn, prop: Any) -> tuple[list[Layer], list[str]]:
+def _layers(seen: Drawn, prop: Any) -> tuple[list[Layer], list[str]]:
     """Return a volume's components, or its own colours, each with its function, and notes.
 
     Raises:
         UsageError: nothing that is drawn, or opacity of another component than that of the colours.
     """
-    array = found.array
+    array = seen.array
     if array is None:
-        what = f"a {found.data.GetClassName()} without an array that its mapper draws"
+        what = f"a {seen.data.GetClassName()} without an array that its mapper draws"
         raise UsageError(f"plotter: {what}; expected one image, grid or mesh with active scalars")
     count, colored = array.GetNumberOfComponents(), not prop.GetIndependentComponents()
     if count == 2 and colored:
         raise UsageError(f"{array.GetName()}: two dependent components; expected one, independent ones, or colours")
     reading: Reading = {"array": array.GetName()}
-    if found.mask is not None:
-        reading["mask"] = found.mask
+    if seen.mask is not None:
+        reading["mask"] = seen.mask
     each: list[Reading] = [reading] if count == 1 else [{**reading, "component": k} for k in range(count)]
-    parts = [volume_of(found.data, one) for one in each]
+    parts = [volume_of(seen.data, one) for one in each]
     mixed = count > 1 and colored
     contents = [OpenedFile(tuple(parts), color=True)] if mixed else [OpenedFile((part,)) for part in parts]
-    functions = [property_json(prop, k, found.scale) for k in range(len(contents))]
+    functions = [property_json(prop, k, seen.scale) for k in range(len(contents))]
     notes = [note for _, some in functions for note in some]
     if len(contents) > 1:
         notes.append("mixing of components (by extinction instead)")

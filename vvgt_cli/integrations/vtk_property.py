@@ -61,12 +61,12 @@ def property_json(prop: Any, component: int = 0, scale: float = 1.0) -> Found:
 
 def _nodes(function: Any, width: int) -> list[list[float]]:
     """Return the nodes of a function of VTK: x, values, midpoint, sharpness."""
-    found = []
+    nodes = []
     for k in range(function.GetSize()):
         node = [0.0] * width
         function.GetNodeValue(k, node)
-        found.append(node)
-    return found
+        nodes.append(node)
+    return nodes
 
 
 def _beyond(nodes: list[list[float]], below: list[float] | None, above: list[float] | None) -> list[list[float]]:

@@ -43,8 +43,8 @@ def _array(mapper: Any, data: Any) -> tuple[Any, bool]:
         return None, False
     where: Any = reference(0)
     choice = mapper.GetScalarMode(), mapper.GetArrayAccessMode(), mapper.GetArrayId(), mapper.GetArrayName() or ""
-    found = vtkAbstractMapper.GetAbstractScalars(data, *choice, where)
-    return found, found is not None and where == 1
+    array = vtkAbstractMapper.GetAbstractScalars(data, *choice, where)
+    return array, array is not None and where == 1
 
 
 def drawn(volume: Any, data: Any = None) -> Drawn:
@@ -126,8 +126,8 @@ def _mask(mapper: Any, crops: bool, image: Any, cells: bool, matrix: np.ndarray)
     def height(affine: np.ndarray, normal: Sequence[float]) -> np.ndarray:
         x, y, z = np.asarray(normal) @ affine[:3, :3]
         start = float(np.asarray(normal) @ affine[:3, 3])
-        found: np.ndarray = z * index[2][:, None, None] + y * index[1][:, None] + x * index[0] + start
-        return found
+        places: np.ndarray = z * index[2][:, None, None] + y * index[1][:, None] + x * index[0] + start
+        return places
 
     affine = _affine(image)
     keep = np.ones(dims[::-1], bool)

@@ -12,8 +12,8 @@ HEADLIGHT, SCENE = 1, 3  # vtkLight's types; 2 moves with the camera
 
 def volumes_of(renderer: Any) -> list[Any]:
     """Return the visible vtkVolumes of a renderer that have data."""
-    found = renderer.GetVolumes()
-    volumes = [found.GetItemAsObject(k) for k in range(found.GetNumberOfItems())]
+    collection = renderer.GetVolumes()
+    volumes = [collection.GetItemAsObject(k) for k in range(collection.GetNumberOfItems())]
     mappers = [(volume, volume.GetMapper()) for volume in volumes if volume.GetVisibility()]
     return [volume for volume, mapper in mappers if mapper is not None and mapper.GetInputDataObject(0, 0) is not None]
 
@@ -55,8 +55,8 @@ def _cross(a: Sequence[float], b: Sequence[float]) -> list[float]:
 
 def lights_of(renderer: Any) -> tuple[list[str], list[str]]:
     """Return the lights of a renderer as ``--light`` takes them, and notes."""
-    found = renderer.GetLights()
-    lights = [found.GetItemAsObject(k) for k in range(found.GetNumberOfItems())]
+    collection = renderer.GetLights()
+    lights = [collection.GetItemAsObject(k) for k in range(collection.GetNumberOfItems())]
     lights = [light for light in lights if light.GetSwitch()]
     fixed = [light for light in lights if light.GetLightType() == SCENE]
     moving = len(lights) - len(fixed)

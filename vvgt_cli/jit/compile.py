@@ -62,19 +62,19 @@ def usual_types(kernel: Any, volume: str) -> tuple[Any, ...]:
     tuples = {kind.__name__: (kind, fields) for kind, fields in kernel.tuples.items()}
 
     def types(usual: str) -> tuple[Any, ...]:
-        found: list[Any] = []
+        kinds: list[Any] = []
         for word in usual.split():
             name, _, axes = word.partition(":")
             if name in tuples:
                 kind, fields = tuples[name]
-                found.append(numba.types.BaseTuple.from_types(types(fields), kind))
+                kinds.append(numba.types.BaseTuple.from_types(types(fields), kind))
             elif name in ("V", "E"):
                 values = getattr(numba.types, volume if name == "V" else "float32")
-                found.append(numba.types.Array(values, 3, "C", readonly=True))
+                kinds.append(numba.types.Array(values, 3, "C", readonly=True))
             else:
                 scalar = getattr(numba.types, name)
-                found.append(numba.types.Array(scalar, int(axes), "C") if axes else scalar)
-        return tuple(found)
+                kinds.append(numba.types.Array(scalar, int(axes), "C") if axes else scalar)
+        return tuple(kinds)
 
     return types(kernel.usual)
 

@@ -102,26 +102,26 @@ def options_of(function: Any) -> list[tuple[str, str]] | None:
 @cache
 def _host() -> tuple[str, str, str]:
     """Return the target, the processor and its features as numba finds them, which asks the system each time."""
-    found: tuple[str, str, str] = cpu_target.target_context.codegen().magic_tuple()
-    return found
+    names: tuple[str, str, str] = cpu_target.target_context.codegen().magic_tuple()
+    return names
 
 
 def processor() -> tuple[Any, ...]:
     """Return what machine code depends on: the target, the processor, its features and numba's settings."""
-    triple, name, found = _host()
-    return triple, name, features(found), [getattr(config, setting, None) for setting in SETTINGS]
+    triple, name, given = _host()
+    return triple, name, features(given), [getattr(config, setting, None) for setting in SETTINGS]
 
 
-def features(found: str) -> str:
-    """Return LLVM's features for those that numba has ``found``: wide vectors where they cost no clock.
+def features(known: str) -> str:
+    """Return LLVM's features for those that numba knows: wide vectors where they cost no clock.
 
     LLVM keeps to vectors of 256 bits on Intel's processors with AVX-512, because the clock of the first of them fell
     with wider ones; the splatter's rows of 16 pixels are one vector of 512 bits (docs/log/refinement.md).
     NUMBA_CPU_FEATURES is obeyed.
     """
-    if config.CPU_FEATURES is not None or WIDE not in found.split(","):
-        return found
-    return f"{found},-prefer-256-bit"
+    if config.CPU_FEATURES is not None or WIDE not in known.split(","):
+        return known
+    return f"{known},-prefer-256-bit"
 
 
 def use_wide_vectors() -> None:

@@ -31,11 +31,11 @@ def folders() -> list[Path]:
     mine = f"vvgt-{hashlib.sha256(str(PACKAGE).encode()).hexdigest()[:12]}"
     if os.environ.get("NUMBA_CACHE_DIR"):
         return [Path(os.environ["NUMBA_CACHE_DIR"]) / mine]
-    found = [PACKAGE / "__pycache__" / "kernels"]
+    places = [PACKAGE / "__pycache__" / "kernels"]
     home = os.environ.get("XDG_CACHE_HOME")
     with contextlib.suppress(RuntimeError, KeyError):  # a user without a home
-        found.append((Path(home) if home and os.path.isabs(home) else Path.home() / ".cache") / "vvgt" / mine)
-    return found
+        places.append((Path(home) if home and os.path.isabs(home) else Path.home() / ".cache") / "vvgt" / mine)
+    return places
 
 
 @cache
@@ -114,9 +114,13 @@ def write(path: Path, payload: bytes) -> None:
     try:
         part.write_bytes(MAGIC + hashlib.sha256(payload).digest() + payload)
         part.replace(path)
+    except PermissionError:  # Windows, while another process reads the file that is there, which has the same code
+        if not path.exists():
+            raise
     finally:
         part.unlink(missing_ok=True)
     name, key = path.name.split("-")[:2]
     for other in path.parent.glob(f"{name}-*"):
         if other.name.split("-")[1] != key:
-            other.unlink(missing_ok=True)
+            with contextlib.suppress(PermissionError):  # Windows, as above
+                other.unlink(missing_ok=True)

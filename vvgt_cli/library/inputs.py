@@ -1,16 +1,17 @@
-"""Arguments of the Python API: their types, the requests that they stand for, and volumes made of arrays."""
+"""Arguments of the Python API: types, the requests that they stand for, volumes made of arrays, files of results."""
 
 from __future__ import annotations
 
 import io
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from numbers import Real
 from typing import Any, BinaryIO, Protocol, TypeAlias, TypedDict
 
 import numpy as np
 
+from vvgt_cli.conversion.gaussian_files import write_gaussians
 from vvgt_cli.conversion.index import function_name
 from vvgt_cli.conversion.recolored import FunctionRequest, parse_layer_look
 from vvgt_cli.conversion.request import ConvertRequest
@@ -19,12 +20,12 @@ from vvgt_cli.errors import UsageError
 from vvgt_cli.field.layered import OpenedFile, open_content
 from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.field.source import SourceRequest, parse_layer
-from vvgt_cli.look import TransferFunction
+from vvgt_cli.gaussians.outputs import Output, claimed, write_text
+from vvgt_cli.look import LabelTable, LightOptions, TransferFunction
 from vvgt_cli.look.isosurfaces import with_levels
 from vvgt_cli.look.label_files import table_of
-from vvgt_cli.look.labels import LabelTable
-from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.progress import Console
+from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.volume import ReadOptions, Volume
 from vvgt_cli.volume.arrays.beside import Neighbour, with_neighbours
 from vvgt_cli.volume.components import contiguous
@@ -200,8 +201,8 @@ def volume_of(volume: VolumeLike, reading: Reading, name: str = "array") -> Volu
         if affine is not None or origin is not None:
             raise UsageError("affine and origin are for arrays, and files have their own; remove them")
         return read_volume(os.fspath(volume), options)
-    found = volume_in_memory(volume, options, origin=origin, affine=affine, name=name)
-    return cut(found, replace(options, stored=isinstance(found.data, Stored)))
+    whole = volume_in_memory(volume, options, origin=origin, affine=affine, name=name)
+    return cut(whole, replace(options, stored=isinstance(whole.data, Stored)))
 
 
 def content_of(volume: VolumeLike, reading: Reading) -> OpenedFile:
@@ -427,3 +428,34 @@ def _array(values: Any, options: ReadOptions, origin: Sequence[float] | None, af
     spacing, direction = unit_rows(matrix[:3, :3].T.tolist())
     place: dict[str, Any] = {"spacing": spacing, "direction": direction, "origin": tuple(matrix[:3, 3].tolist())}
     return replace(volume, **place, space=options.space if options.space in SPACES else None)
+
+
+def written(
+    make: Callable[[Run], Result], name: str, inputs: Sequence[str], output: PathLike | None,
+    report: PathLike | None = None, *, overwrite: bool, progress: bool | Console, suffixes: tuple[str, ...] = (".ply",),
+) -> Result:  # fmt: skip
+    """Return a result, written where there is an output, and its report; both are checked before the work begins.
+
+    Args:
+        make: makes the result.
+        name: of the run.
+        inputs: files that are read, which no output may replace.
+        output: file of Gaussians, "-" for standard output, None for none.
+        report: JSON to write, likewise.
+        overwrite: replace files that exist.
+        progress: print messages and bars on standard error, or the console that does.
+        suffixes: endings that the output may have.
+
+    Raises:
+        UsageError, DataError: see `check_outputs`.
+    """
+    outputs = Output.of("-o", output, suffixes, splats=True) + Output.of("--report", report, (".json",), binary=False)
+    run = Run(console_of(progress), ConversionReport(name))
+    with claimed(outputs, inputs, overwrite):
+        result = make(run)
+        if output is not None:
+            write_gaussians(run, os.fspath(output), result.gaussians, result.ply, overwrite)
+        run.finish()
+        if report is not None:
+            write_text(report, run.report.to_json(), overwrite)
+    return result

@@ -165,11 +165,11 @@ class ColorMap:
         colors = np.concatenate([_ciede2000_path(a, b, *bend) for (a, b), bend in zip(pairs, bends, strict=False)])
         places = np.concatenate([np.linspace(a, b, PATH_SAMPLES) for a, b in pairwise(nodes)])
         # from right to left: of samples at one position `interp` takes the last
-        found = np.stack([np.interp(-x, -places[::-1], channel[::-1]) for channel in colors.T], axis=-1)
+        along = np.stack([np.interp(-x, -places[::-1], channel[::-1]) for channel in colors.T], axis=-1)
         ends = ((x <= nodes[0], self.rgb[0]), (x > nodes[-1], self.rgb[-1]), (np.isnan(x), self.nan_color))
         for there, color in ends:
-            found[there] = color
-        return found
+            along[there] = color
+        return along
 
 
 def _check_nodes(nodes: PiecewiseOpacity | ColorMap, what: str, column: str, called: str) -> None:
@@ -200,8 +200,8 @@ def _check_nodes(nodes: PiecewiseOpacity | ColorMap, what: str, column: str, cal
 def _each(function: Callable[[float], Any], x: np.ndarray, kind: Any) -> np.ndarray:
     """Apply ``function`` to each element of x, any shape; return an array of dtype ``kind``."""
     values, places = np.unique(np.asarray(x, np.float64), return_inverse=True)
-    found = np.fromiter(map(function, values.tolist()), kind, values.size)
-    return found[places.reshape(np.shape(x))]
+    distinct = np.fromiter(map(function, values.tolist()), kind, values.size)
+    return distinct[places.reshape(np.shape(x))]
 
 
 def _vtk_colors(space: str, hsv_wrap: bool, *columns: np.ndarray) -> Any:

@@ -12,8 +12,7 @@ from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.readers.names import named_function
 from vvgt_cli.look.recognise import SIDE, background_bins, in_hounsfield, moments
 from vvgt_cli.look.resolve import resolve
-from vvgt_cli.volume.stats import Statistics
-from vvgt_cli.volume.types import DENSITY
+from vvgt_cli.volume import DENSITY, Statistics
 
 NAME = "automatic (histogram)"
 HOUNSFIELD = "automatic (Hounsfield units)"

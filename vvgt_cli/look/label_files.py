@@ -13,7 +13,7 @@
 - ParaView: categorical presets with `IndexedColors` and `Annotations` [value, name, ...].
 
 Labels without a colour get distinct ones. Groups of labels come from coded terms or, in JSON, from "parents" and
-regions (`vvgt_cli.look.terms`).
+regions (`vvgt_cli.look.labels`).
 """
 
 from __future__ import annotations
@@ -28,11 +28,23 @@ from pathlib import Path
 from typing import Any
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.look.labels import AUTO, MAX_NAME, SOLID, Label, LabelTable, clean_name, distinct, palette_color
+from vvgt_cli.look.labels import (
+    AUTO,
+    MAX_NAME,
+    SOLID,
+    Codes,
+    Label,
+    LabelTable,
+    clean_name,
+    codes_of,
+    codes_of_row,
+    distinct,
+    palette_color,
+    parents_of,
+)
 from vvgt_cli.look.readers import lut, minimal, slicer
 from vvgt_cli.look.readers.fields import json_of, number, rgb, table, text_of
 from vvgt_cli.look.readers.paraview import choose
-from vvgt_cli.look.terms import Codes, codes_of, codes_of_row, parents_of
 from vvgt_cli.volume.components import listed
 from vvgt_cli.volume.dicom import segmentation as dicom
 from vvgt_cli.volume.dicom.segmentation import is_segmentation_file
@@ -155,10 +167,10 @@ def table_beside(source: str | None) -> str | None:
     return next((os.path.relpath(file) for file in files if file.is_file() and is_table(file)), None)
 
 
-def _table(found: list[Label], what: str) -> LabelTable:
-    if not found:
+def _table(labels: list[Label], what: str) -> LabelTable:
+    if not labels:
         raise DataError(f"{what}: no labels; {EXPECTED}")
-    return LabelTable(Path(what).name, tuple(sorted(found, key=lambda label: label.number)))
+    return LabelTable(Path(what).name, tuple(sorted(labels, key=lambda label: label.number)))
 
 
 def _lines(text: str, path: Path) -> list[Label]:
@@ -189,14 +201,14 @@ def _separated(text: str, path: Path) -> list[Label]:
         names, body = (NAMELESS, lines) if _INTEGER.fullmatch("".join(head[:1])) else (head, lines[1:])
         for n, cells in enumerate(csv.DictReader(body, names, delimiter=comma), 1):
             texts = {key: " ".join(cell.splitlines()).strip() for key, cell in cells.items() if isinstance(cell, str)}
-            found = {key: next((texts[k] for k in keys if texts.get(k)), "") for key, keys in COLUMNS.items()}
-            value, color = found["number"].removesuffix(".0"), [found[key] for key in "rgb" if found[key]]
-            numbers = all(_DECIMAL.fullmatch(found[key] or "0") for key in "rgba")
+            fields = {key: next((texts[k] for k in keys if texts.get(k)), "") for key, keys in COLUMNS.items()}
+            value, color = fields["number"].removesuffix(".0"), [fields[key] for key in "rgb" if fields[key]]
+            numbers = all(_DECIMAL.fullmatch(fields[key] or "0") for key in "rgba")
             if not _INTEGER.fullmatch(value) or len(color) in (1, 2) or not numbers:
                 raise DataError(f"{path}: row {n}: label {value[:20]!r}, colour {', '.join(color)[:40]}; {EXPECTED}")
-            shown = [float(v) / 255 for v in color] or _hex(found["color"])
-            last = float(found["a"]) / 255 if found["a"] else None
-            rows.append((f"{path}: row {n}", int(value), found["name"], shown, last, True, codes_of_row(texts)))
+            shown = [float(v) / 255 for v in color] or _hex(fields["color"])
+            last = float(fields["a"]) / 255 if fields["a"] else None
+            rows.append((f"{path}: row {n}", int(value), fields["name"], shown, last, True, codes_of_row(texts)))
     except csv.Error as error:
         raise DataError(f"{path}: {error}; {EXPECTED}") from None
     return _labels(rows, path, text, "color_a" in head)
@@ -210,11 +222,11 @@ def _labels(rows: list[Row], path: Path, text: str, opacity: bool) -> list[Label
         raise DataError(f"{path}: no colour above 1; expected red, green and blue from 0 to 255")
     if blank := [row[1] for row in rows if row[3] is None]:
         warnings.warn(f"{path.name}: {len(blank)} labels have no colour; given distinct ones", stacklevel=2)
-    found = []
+    labels = []
     for here, value, name, color, last, shown, codes in rows:
         alpha = 0.0 if not value else SOLID if last is None else last if opacity else 1 - last
-        found.append(_label(here, value, name, color, alpha, shown, codes))
-    return found
+        labels.append(_label(here, value, name, color, alpha, shown, codes))
+    return labels
 
 
 def _is_opacity(alphas: list[float], path: Path, text: str) -> bool:
@@ -281,11 +293,11 @@ def table_of(parsed: Any, what: str, pick: str = "") -> LabelTable:
 def _record(one: Any, what: str) -> tuple[str, Any]:
     """Return number and entry of a label that is one of a list, an object with keys as in `COLUMNS`."""
     lower = {key.lower(): value for key, value in one.items()} if isinstance(one, dict) else {}
-    found = {key: next((lower[k] for k in keys if lower.get(k) is not None), None) for key, keys in COLUMNS.items()}
-    if not _INTEGER.fullmatch(str(found["number"])):
+    fields = {key: next((lower[k] for k in keys if lower.get(k) is not None), None) for key, keys in COLUMNS.items()}
+    if not _INTEGER.fullmatch(str(fields["number"])):
         raise DataError(f"{what}: {str(one)[:40]!r}, without a number; {EXPECTED}")
-    entry = {key: found[key] for key in ("name", "color") if found[key] is not None}
-    return str(found["number"]), {key: lower[key] for key in ("opacity", "parents", "visible") if key in lower} | entry
+    entry = {key: fields[key] for key in ("name", "color") if fields[key] is not None}
+    return str(fields["number"]), {key: lower[key] for key in ("opacity", "parents", "visible") if key in lower} | entry
 
 
 def _entries(entries: list[tuple[str, Any]], what: str) -> list[Label]:
@@ -331,14 +343,14 @@ def _of_regions(regions: dict[str, list[int]], what: str) -> list[Label]:
     A label is called as the smallest region that it is in, and is in the groups of the larger ones. Raise DataError for
     two names of one number.
     """
-    found = []
+    labels = []
     for one in sorted({one for numbers in regions.values() for one in numbers}):
         *groups, name = sorted((key for key in regions if one in regions[key]), key=lambda key: -len(regions[key]))
         if groups and len(regions[groups[-1]]) == 1:
             raise DataError(f"{what}: label {one} is {name[:40]!r} and {groups[-1][:40]!r}; expected one name")
         label = _label(f"{what}: label {one}", one, name, None, SOLID if one else 0.0)
-        found.append(replace(label, parents=tuple(groups)) if groups else label)
-    return found
+        labels.append(replace(label, parents=tuple(groups)) if groups else label)
+    return labels
 
 
 def _annotated(presets: list[dict[str, Any]], what: str, pick: str) -> list[Label]:
@@ -357,12 +369,12 @@ def _annotated(presets: list[dict[str, Any]], what: str, pick: str) -> list[Labe
 
 def labels_of(segments: Sequence[Segment], what: str) -> list[Label]:
     """Return the labels of segments; 0 is the background unless its opacity is stated."""
-    found = []
+    labels = []
     for one in segments:
         opacity = (SOLID if one.number else 0.0) if one.opacity is None else one.opacity
         color = None if one.color is None else list(one.color)
-        found.append(_label(what, one.number, one.name, color, opacity, codes=codes_of(one.terms)))
-    return found
+        labels.append(_label(what, one.number, one.name, color, opacity, codes=codes_of(one.terms)))
+    return labels
 
 
 def _label(

@@ -1,7 +1,8 @@
 """`LabelTable`: names, colours and opacities of a label map's labels; `label_files` reads its files.
 
 A name is cleaned by `clean_name`, and leaves in headers (`Label.comment`), legends (`labels_legend`), pages
-(`Label.page_entry`) and names of files (`Label.stem`). `merge_labels` joins the labels of several files.
+(`Label.page_entry`) and names of files (`Label.stem`). `merge_labels` joins the labels of several files; `parents_of`
+names the groups of a label.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import json
 import re
 import warnings
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from itertools import pairwise
@@ -28,6 +29,14 @@ AUTO, NO_LABELS = "auto", "none"  # values of --labels: distinct colours, or a s
 MAX_NAME, MAX_STEM = 200, 80  # characters of a label's name: in headers, and in names of files
 MAX_LEGEND = 24  # labels of a legend
 SOLID = 1.0  # opacity of a label whose table says none
+PARTS = ("category", "type", "type_modifier", "region", "region_modifier")
+GROUPING = ("category", "region", "type")  # parts that are groups, from the outermost
+_COLUMNS = ("Category", "Type", "TypeModifier", "Region", "RegionModifier")  # of a .csv of 3D Slicer, in PARTS' order
+_CODE = ("CodingScheme", "CodeValue", "CodeMeaning")
+_SIDES = {"l": "Left", "r": "Right"}
+_TISSUES = {"ctx": "cortex", "wm": "white matter"}
+_SURFACE = re.compile(r"(ctx|wm)[-_](l|r)h[-_]")
+_SIDE = re.compile(r"(Left|Right)-")
 
 
 @dataclass(frozen=True)
@@ -40,7 +49,7 @@ class Label:
         color: RGB in [0, 1].
         opacity: in [0, 1] per unit distance.
         parents: names of the groups that it is in, from the outermost.
-        codes: what its table says of it by coded terms (`vvgt_cli.look.terms`).
+        codes: what its table says of it by coded terms (`vvgt_cli.look.labels`).
         hidden_opacity: opacity that it would have if its table did not switch it off, 0 if it does not.
         automatic: its colour was chosen by its number, not stated.
     """
@@ -61,12 +70,12 @@ class Label:
 
     def facts(self) -> dict[str, Any]:
         """Return the entries of the label in an index and in files with nodes."""
-        found: dict[str, Any] = {"label": self.number, "color": self.color, "opacity": self.shown_opacity}
+        facts: dict[str, Any] = {"label": self.number, "color": self.color, "opacity": self.shown_opacity}
         if self.parents:
-            found["parents"] = self.parents
+            facts["parents"] = self.parents
         if self.codes:
-            found["terminology"] = {part: f"{code} {meaning}" for part, code, meaning in self.codes}
-        return found if self.opacity else found | {"visible": False}
+            facts["terminology"] = {part: f"{code} {meaning}" for part, code, meaning in self.codes}
+        return facts if self.opacity else facts | {"visible": False}
 
     @property
     def key(self) -> tuple[int, str]:
@@ -136,8 +145,8 @@ class LabelTable:
 
     def _rows(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the row of each of x (n,), and whether it has one."""
-        found = np.minimum(np.searchsorted(self._numbers, np.where(np.isnan(x), np.inf, x)), len(self.labels) - 1)
-        return found, self._numbers[found] == x
+        rows = np.minimum(np.searchsorted(self._numbers, np.where(np.isnan(x), np.inf, x)), len(self.labels) - 1)
+        return rows, self._numbers[rows] == x
 
     def opacity(self, x: np.ndarray) -> np.ndarray:
         """Return the opacity in [0, 1] per unit distance of labels x (n,); 0 without an entry."""
@@ -261,3 +270,34 @@ def merge_labels(labels: Iterable[Label]) -> tuple[Label, ...]:
     for label in labels:
         first.setdefault(label.key, label)
     return tuple(first[key] for key in sorted(first))
+
+
+Codes = tuple[tuple[str, str, str], ...]  # (part, "scheme:value", meaning) of each part that is there
+
+
+def codes_of(terms: Sequence[Sequence[str]]) -> Codes:
+    """Return the codes of (scheme, value, meaning), one for each of `PARTS` or none; omit those without meaning."""
+    stated = zip(PARTS, terms, strict=False)
+    return tuple((part, f"{scheme}:{value}", meaning) for part, (scheme, value, meaning) in stated if meaning.strip())
+
+
+def codes_of_row(cells: Mapping[str, str]) -> Codes:
+    """Return the codes in a row of a `.csv` of 3D Slicer; the names of its columns are in lower case."""
+    return codes_of([[cells.get(f"{column}_{field}".lower(), "") for field in _CODE] for column in _COLUMNS])
+
+
+def parents_of(name: str, codes: Codes) -> tuple[str, ...]:
+    """Return the groups of a label, from the outermost: by its codes, else by a name of FreeSurfer's."""
+    meanings = {part: meaning for part, _, meaning in codes}
+    groups: list[str] = []
+    for part in GROUPING:
+        group = meanings.get(part, "")
+        if group and group.casefold() not in (name.casefold(), *(groups[-1:] and [groups[-1].casefold()])):
+            groups.append(group)
+    if codes:
+        return tuple(groups)
+    if surface := _SURFACE.match(name):
+        side = _SIDES[surface[2]]
+        return side, f"{side} {_TISSUES[surface[1]]}"
+    side_of = _SIDE.match(name)
+    return (side_of[1],) if side_of else ()

@@ -86,10 +86,10 @@ def parse_lighting(text: str) -> Lighting:
     if "occlusion" in rest:
         at = rest.index("occlusion")
         occlusion, rest = float(rest[at + 1]), rest[:at] + rest[at + 2 :]
-    found = Lighting(HEADLIGHT in rest, _directions([w for w in rest if "," in w], None), *numbers)
+    lighting = Lighting(HEADLIGHT in rest, _directions([w for w in rest if "," in w], None), *numbers)
     if known := set(rest) - {HEADLIGHT, "shadows"} - {w for w in rest if "," in w}:
         raise ValueError(known)
-    return replace(found, shadows="shadows" in rest, occlusion=occlusion)
+    return replace(lighting, shadows="shadows" in rest, occlusion=occlusion)
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,8 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.look.function import BY, PER_VOXEL, TransferFunction
 from vvgt_cli.look.isosurfaces import Isosurfaces
 from vvgt_cli.look.recognise import foreground, in_hounsfield, moments
+from vvgt_cli.volume import Statistics, Volume
 from vvgt_cli.volume.components import listed
-from vvgt_cli.volume.stats import Statistics
-from vvgt_cli.volume.types import Volume
 
 ABOUT_ONE = 2.0  # span of data up to which nodes in [0, 1] are values of theirs
 
@@ -60,20 +59,12 @@ def resolve(
             stacklevel=2,
         )
         tf = replace(tf.otherwise, name=f"{tf.name} ({BY[tf.otherwise.domain]})")
+    if not isinstance(chosen, str) or chosen == "rescale" or tf.domain == "fraction":
+        return placed(tf, (lo, hi) if isinstance(chosen, str) else chosen)
+    if isinstance(tf, Isosurfaces):
+        return tf.placed(statistics, hounsfield or look_like_hounsfield(statistics))
     if tf.domain in BY:
-        if chosen != "data":
-            raise UsageError(f"{tf.name}: its nodes are {BY[tf.domain]} of the data; omit --tf-range")
-        if isinstance(tf, Isosurfaces):
-            return tf.placed(statistics, hounsfield or look_like_hounsfield(statistics))
         return tf.moved(_positions(tf, statistics))
-    if tf.domain == "fraction":
-        a, b = (lo, hi) if isinstance(chosen, str) else chosen
-        fraction = tf.breakpoints()
-        return tf.moved(a * (1 - fraction) + b * fraction)
-    if chosen == "rescale":
-        return tf.rescaled(lo, hi)
-    if not isinstance(chosen, str):
-        return tf.rescaled(*chosen)
     first, last = tf.node_range()
     if not (first >= 0 and last <= 1 and (lo < 0 or hi > 1)):
         return tf
@@ -84,6 +75,22 @@ def resolve(
     asked = f"--tf-range {first:g},{last:g}"
     warnings.warn(f"{where}; stretched to the data, as with --tf-range rescale ({asked}: data values)", stacklevel=2)
     return tf.rescaled(lo, hi)
+
+
+def placed(tf: TransferFunction, limits: tuple[float, float] | None) -> TransferFunction:
+    """Return the function on data values, stretched to ``limits``; raise UsageError where they do not suit it."""
+    if tf.domain in BY:
+        if limits is not None:
+            raise UsageError(f"{tf.name}: its nodes are {BY[tf.domain]} of the data; omit --tf-range")
+        return tf
+    if tf.domain == "fraction":
+        if limits is None:
+            raise UsageError(
+                f"{tf.name}: its nodes are fractions of the range of the data; give that range as --tf-range LO,HI"
+            )
+        share = tf.breakpoints()
+        return tf.moved(limits[0] * (1 - share) + limits[1] * share)
+    return tf if limits is None else tf.rescaled(*limits)
 
 
 def unit_of_values(stated: str, tf: object) -> str:

@@ -18,10 +18,9 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.look.histogram import contours
 from vvgt_cli.look.recognise import AIR, air_and_tissue, background_bins, foreground, in_hounsfield
+from vvgt_cli.volume import DENSITY, Statistics, Volume
 from vvgt_cli.volume.bodies import largest
-from vvgt_cli.volume.stats import Statistics
 from vvgt_cli.volume.stored import planes
-from vvgt_cli.volume.types import DENSITY, Volume
 
 BY_VALUE = 0.5  # bands are equal half by the voxels in them, half by their width
 WIDE = 0.25  # share of the value range; air and padding are narrow, a turbulent field's peak is the field
@@ -151,10 +150,10 @@ def _rgb(lab: np.ndarray) -> np.ndarray:
     """Return sRGB (n, 3) in [0, 1] of CIE L*a*b* colours (n, 3)."""
     from vtkmodules.vtkCommonCore import vtkMath
 
-    found = np.empty_like(lab)
-    for row, out in zip(lab, found, strict=True):
+    rgb = np.empty_like(lab)
+    for row, out in zip(lab, rgb, strict=True):
         vtkMath.LabToRGB(row, out)
-    return found.clip(0, 1)
+    return rgb.clip(0, 1)
 
 
 def fitting(statistics: Statistics, volume: Volume) -> str | None:

@@ -172,9 +172,9 @@ def difference(network: Vvgt, model: Model) -> float:
             expected = network(tensors_of(scene.arrays())).numpy()
         if np.allclose(expected, scene.rows, atol=1e-5):
             raise DataError("the network's head is zero: it returns its input and cannot be compared")
-        found = model.run_rows(scene)
+        fields = model.run_rows(scene)
         largest = np.abs(expected).max(axis=0)  # (14,)
-        worst = max(worst, float((np.abs(found - expected).max(axis=0) / np.maximum(largest, 1e-6)).max()))
+        worst = max(worst, float((np.abs(fields - expected).max(axis=0) / np.maximum(largest, 1e-6)).max()))
     return worst
 
 

@@ -145,11 +145,11 @@ def corners(uv: Tensor, height: int, width: int) -> list[tuple[Tensor, Tensor]]:
     x0, y0 = left.long(), top.long()
     x1, y1 = (x0 + 1).clamp(max=width - 1), (y0 + 1).clamp(max=height - 1)
     first = (torch.arange(views, device=uv.device) * (height * width))[:, None]  # (n, 1)
-    found = []
+    near = []
     for yy, wy in ((y0, 1 - fy), (y1, fy)):
         for xx, wx in ((x0, 1 - fx), (x1, fx)):
-            found.append(((first + yy * width + xx).reshape(-1), (wy * wx).reshape(-1, 1)))
-    return found
+            near.append(((first + yy * width + xx).reshape(-1), (wy * wx).reshape(-1, 1)))
+    return near
 
 
 class EpipolarCrossAttention(nn.Module):

@@ -13,10 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from vvgt_cli.cameras import Camera
-from vvgt_cli.cameras.quaternions import quaternion
+from vvgt_cli.cameras.types import quaternion
 from vvgt_cli.errors import DataError
-from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.rules import INRIA, Rule
+from vvgt_cli.gaussians import INRIA, Gaussians, Rule
 from vvgt_cli.network import tables
 from vvgt_cli.network.config import STEP, NetworkConfig
 

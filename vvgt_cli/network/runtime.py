@@ -12,8 +12,7 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera, farthest_cameras
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.rules import INRIA, Rule
+from vvgt_cli.gaussians import INRIA, Gaussians, Rule
 from vvgt_cli.network import tables
 from vvgt_cli.network.card import IMAGE_INPUTS, MAPS, OUTPUT, ModelCard, read_card
 from vvgt_cli.network.config import NetworkConfig
@@ -158,13 +157,13 @@ def _check_names(path: Path, session: Any, record: dict[str, Any], config: Netwo
     made = {*IMAGE_INPUTS} if image else {"gaussians", "gradients", "matrices", "eyes", *MAPS}
     if not image:
         made |= set(tables.build(np.zeros((1, 3), np.float32), config.geometry))
-    found = [entry.name for entry in session.get_inputs()], [entry.name for entry in session.get_outputs()]
-    for side, has, expected in zip(("inputs", "outputs"), found, (record["inputs"], record["outputs"]), strict=True):
+    names = [entry.name for entry in session.get_inputs()], [entry.name for entry in session.get_outputs()]
+    for side, has, expected in zip(("inputs", "outputs"), names, (record["inputs"], record["outputs"]), strict=True):
         if has != expected:
             raise DataError(f"{path}: {side} {', '.join(has)}; its card says {', '.join(expected)}: {_AGAIN}")
-    if unknown := set(found[0]) - made:
+    if unknown := set(names[0]) - made:
         raise DataError(f"{path}: needs {', '.join(sorted(unknown))}, which this version does not provide: {_AGAIN}")
-    if found[1] != (MAPS if image else [OUTPUT]):
+    if names[1] != (MAPS if image else [OUTPUT]):
         raise DataError(
-            f"{path}: gives {', '.join(found[1])}; expected {', '.join(MAPS if image else [OUTPUT])}: {_AGAIN}"
+            f"{path}: gives {', '.join(names[1])}; expected {', '.join(MAPS if image else [OUTPUT])}: {_AGAIN}"
         )

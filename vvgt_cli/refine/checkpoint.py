@@ -18,8 +18,7 @@ import numpy as np
 from vvgt_cli.cameras.blocks import picked
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
-from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.rules import INRIA, Rule
+from vvgt_cli.gaussians import INRIA, Gaussians, Rule
 from vvgt_cli.images.metrics import mean_psnr
 from vvgt_cli.refine.options import Check, OptimizeOptions, OptimizeRecord
 
@@ -89,17 +88,17 @@ class Checks:
 
 def fingerprint(gaussians: Gaussians, options: OptimizeOptions, *views: Any) -> str:
     """Hash all that a run depends on; ``views``: `Train`, `Check` or None."""
-    found = hashlib.sha256(f"{STEPPED} {replace(options, checkpoint=None)!r}".encode())
+    digest = hashlib.sha256(f"{STEPPED} {replace(options, checkpoint=None)!r}".encode())
     for array in gaussians.arrays().values():
-        found.update(array.tobytes())
+        digest.update(array.tobytes())
     for part in filter(None, views):
-        found.update(repr(part[2:3]).encode())
+        digest.update(repr(part[2:3]).encode())
         for camera, image in zip(part[0], part[1], strict=True):
-            found.update(repr(camera).encode())
-            found.update(image.tobytes())
+            digest.update(repr(camera).encode())
+            digest.update(image.tobytes())
         for weight in (*part, None, None)[3] or ():
-            found.update(weight.tobytes())
-    return found.hexdigest()
+            digest.update(weight.tobytes())
+    return digest.hexdigest()
 
 
 def save(path: str, key: str, state: State, checks: Checks, record: OptimizeRecord, walk: dict[str, Any]) -> None:

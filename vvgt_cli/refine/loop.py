@@ -8,8 +8,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera
-from vvgt_cli.cameras.blocks import BLOCK, Blocks
+from vvgt_cli.cameras import BLOCK, Blocks, Camera
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.progress import ProgressCallback

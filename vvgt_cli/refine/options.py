@@ -14,8 +14,7 @@ from vvgt_cli.gaussians.rules import INRIA, Rule
 if TYPE_CHECKING:
     import numpy as np
 
-    from vvgt_cli.cameras import Camera
-    from vvgt_cli.cameras.blocks import Blocks
+    from vvgt_cli.cameras import Blocks, Camera
 
 METHODS = ("axes", "adam", "3dgs")
 LOSS_3DGS = {"l1": 0.8, "l2": 0.0, "ssim": 0.2, "alpha": 0.0}

@@ -63,8 +63,8 @@ def aligned(means: np.ndarray, factors: np.ndarray, logits: np.ndarray, colors: 
     far = np.minimum(np.abs(pull), FARTHEST).astype(np.float32)  # in lengths of the axis: flat ones have no bound
     known = np.concatenate([values[:, :7], beside[:, :7], far], axis=1)
     spread = known.std(axis=0, dtype=np.float64)
-    found = (known - known.mean(axis=0, dtype=np.float64)) / np.where(spread > 1e-9, spread, np.inf)
-    standard: np.ndarray = np.clip(found, -FARTHEST, FARTHEST).astype(np.float32)
+    scaled = (known - known.mean(axis=0, dtype=np.float64)) / np.where(spread > 1e-9, spread, np.inf)
+    standard: np.ndarray = np.clip(scaled, -FARTHEST, FARTHEST).astype(np.float32)
     return standard
 
 
@@ -111,8 +111,8 @@ class SharedSteps:
 
         def rows(part: np.ndarray) -> np.ndarray:
             bent = np.maximum(part @ mixing + offsets, 0) - middle
-            found = np.concatenate([np.ones((len(part), 1), np.float32), part, bent], axis=1)
-            rounded: np.ndarray = np.clip(np.rint(found * ONE), -MAX_FEATURE, MAX_FEATURE)
+            features = np.concatenate([np.ones((len(part), 1), np.float32), part, bent], axis=1)
+            rounded: np.ndarray = np.clip(np.rint(features * ONE), -MAX_FEATURE, MAX_FEATURE)
             return rounded
 
         numbers = rows(some).astype(np.float64)
@@ -133,16 +133,16 @@ class SharedSteps:
 
         Not of what turns the axes: it has no sign that means the same for all.
         """
-        found = np.empty((KNOWN, FEATURES), np.float32)
-        steps.regress(self.solver, directions, self.factor, found)
-        plain = found.astype(np.float64) / self.factor
+        weights = np.empty((KNOWN, FEATURES), np.float32)
+        steps.regress(self.solver, directions, self.factor, weights)
+        plain = weights.astype(np.float64) / self.factor
         size = math.sqrt(float(np.square(plain).sum()) * float(np.square(self.before).sum()))
         if 0 < size < math.inf:
             cosine = float((plain * self.before).sum()) / size
             self.agreement = RECALL * self.agreement + (1 - RECALL) * cosine
             self.factor = min(max(self.factor * math.exp(PACE * (self.agreement - AGREEING)), BOUNDS[0]), BOUNDS[1])
         self.before = plain
-        return found
+        return weights
 
     def last(self) -> np.ndarray:
         """Return the last prediction (KNOWN x FEATURES), its factor and agreement, in one array."""

@@ -17,11 +17,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera
-from vvgt_cli.cameras.blocks import Blocks
-from vvgt_cli.gaussians import SH_C0, Gaussians
+from vvgt_cli.cameras import Blocks, Camera
+from vvgt_cli.gaussians import INRIA, SH_C0, Gaussians, Rule
 from vvgt_cli.gaussians.frames import axes_of, rotations
-from vvgt_cli.gaussians.rules import INRIA, Rule
 from vvgt_cli.refine import steps
 from vvgt_cli.refine.loss import picture_slope
 from vvgt_cli.refine.options import OptimizeOptions
@@ -422,7 +420,7 @@ def densify(
         (Gaussians, origin): ``origin`` (K',) is the index that each had before, -1 for new ones.
     """
     g = gaussians
-    opacity = 1 / (1 + np.exp(-g.opacity_logits.astype(np.float64)))
+    opacity = g.opacity
     keep = np.flatnonzero(opacity >= FAINTEST) if (opacity >= FAINTEST).any() else np.array([int(opacity.argmax())])
     keep = keep[np.argsort(-opacity[keep], kind="stable")[:limit]]
     keep.sort()

@@ -69,9 +69,9 @@ def pareto(runs: Sequence[Run]) -> list[Run]:
     """Return the Pareto front by time: runs that no other beats in both time and PSNR."""
     best, kept = -math.inf, []
     for run in sorted(runs, key=lambda run: (cost(run), -(psnr(run) or 0))):
-        found = psnr(run)
-        if found is not None and found > best:
-            best = found
+        reached = psnr(run)
+        if reached is not None and reached > best:
+            best = reached
             kept.append(run)
     return kept
 
@@ -93,11 +93,11 @@ def unit_costs(runs: Sequence[Run]) -> dict[str, float]:
 
     Keys name the unit: a training view, a step of refinement, a megabyte, a run.
     """
-    found: dict[str, list[float]] = {}
+    costs: dict[str, list[float]] = {}
 
     def note(key: str, seconds: float, units: float) -> None:
         if units > 0:
-            found.setdefault(key, []).append(seconds / units)
+            costs.setdefault(key, []).append(seconds / units)
 
     for run in runs:
         for stage in run["stages"]:
@@ -110,7 +110,7 @@ def unit_costs(runs: Sequence[Run]) -> dict[str, float]:
                 note("write, a megabyte", seconds, run["bytes"] / 1e6)
             elif name not in SCORING and run["kind"] not in ("baseline", "peer"):
                 note(f"{name}, a run", seconds, 1)
-    return {key: statistics.median(values) for key, values in found.items()}
+    return {key: statistics.median(values) for key, values in costs.items()}
 
 
 def table(runs: Sequence[Run]) -> str:
@@ -134,16 +134,16 @@ def table(runs: Sequence[Run]) -> str:
 
 def stage_names(runs: Sequence[Run]) -> list[str]:
     """List the stages of all runs: known ones in their order, then others."""
-    found = {stage["name"] for run in runs for stage in run["stages"]}
-    return [name for name in STAGES if name in found] + sorted(found - set(STAGES))
+    names = {stage["name"] for run in runs for stage in run["stages"]}
+    return [name for name in STAGES if name in names] + sorted(names - set(STAGES))
 
 
 def _seconds(run: Run) -> dict[str, float]:
     """Return seconds by stage; stages of one name are added."""
-    found: dict[str, float] = {}
+    seconds: dict[str, float] = {}
     for stage in run["stages"]:
-        found[stage["name"]] = found.get(stage["name"], 0.0) + float(stage["seconds"])
-    return found
+        seconds[stage["name"]] = seconds.get(stage["name"], 0.0) + float(stage["seconds"])
+    return seconds
 
 
 def read_series(path: str) -> ReportRuns:

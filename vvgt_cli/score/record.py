@@ -150,13 +150,13 @@ def machine() -> dict[str, Any]:
 
 def versions() -> dict[str, str]:
     """Return the versions of this program and of imported libraries that its numbers depend on."""
-    found = {"vvgt": VERSION, "python": platform.python_version()}
+    known = {"vvgt": VERSION, "python": platform.python_version()}
     for name in ("numpy", "numba", "vtkmodules"):
         module = sys.modules.get(name)
         version = getattr(module, "__version__", None)
         if version:
-            found["vtk" if name == "vtkmodules" else name] = str(version)
-    return found
+            known["vtk" if name == "vtkmodules" else name] = str(version)
+    return known
 
 
 @dataclass

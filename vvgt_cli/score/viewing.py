@@ -8,17 +8,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera, default_views, look_at
+from vvgt_cli.cameras import FIELD_OF_VIEW, Camera, default_views, look_at, to_box_frame
 from vvgt_cli.cameras.blocks import ENOUGH, Blocks, picked, spread_blocks
-from vvgt_cli.cameras.boxed import to_box_frame
-from vvgt_cli.cameras.sets import FIELD_OF_VIEW
 from vvgt_cli.gaussians.rules import INRIA, RULES, Rule
 from vvgt_cli.gaussians.targets import target_of
 from vvgt_cli.progress import ProgressCallback
 
 if TYPE_CHECKING:
-    from vvgt_cli.dvr import RenderSettings, Scene
-    from vvgt_cli.dvr.render import Viewed
+    from vvgt_cli.dvr import RenderSettings, Scene, Viewed
     from vvgt_cli.images.metrics import Texture
     from vvgt_cli.splat.render import Shown
 
@@ -109,23 +106,23 @@ def condition_pictures(
     places: Iterable[tuple[int, float]], views: Collection[int] = VIEWS, enough: int = ENOUGH
 ) -> list[ConditionPicture]:
     """List every place with the camera of each view, and the blocks of its picture that are scored."""
-    found = []
+    pictures = []
     for size, field_of_view in places:
         cameras = default_views("test", size=size)
         for i in views:
             camera, blocks = zoomed(cameras[i], field_of_view), spread_blocks(size, size, i, enough)
-            found.append((ViewingPlace(size, field_of_view), camera, blocks))
-    return found
+            pictures.append((ViewingPlace(size, field_of_view), camera, blocks))
+    return pictures
 
 
 def distance_pictures(size: int, views: Collection[int] = SIDE, enough: int = ENOUGH) -> list[ConditionPicture]:
     """List pictures of the middle from `DISTANCES`, as `condition_pictures`, for levels that distances select."""
-    found = []
+    pictures = []
     for distance in DISTANCES:
         place = ViewingPlace(size, FIELD_OF_VIEW, f"from {distance:g}")
         cameras = default_views("test", size=size, radius=distance)
-        found += [(place, cameras[i], spread_blocks(size, size, i, enough)) for i in views]
-    return found
+        pictures += [(place, cameras[i], spread_blocks(size, size, i, enough)) for i in views]
+    return pictures
 
 
 def eye_pictures(
@@ -144,7 +141,7 @@ def eye_pictures(
     device = target_of(target)
     if device is None or device.focal is None:
         return []
-    size, found = round(2 * device.focal * float(np.tan(np.radians(FIELD_OF_VIEW / 2)))), []
+    size, pictures = round(2 * device.focal * float(np.tan(np.radians(FIELD_OF_VIEW / 2)))), []
     for away in AWAY:
         place = ViewingPlace(size, FIELD_OF_VIEW, f"{device.name} both eyes {away:g} m")
         for i in views:
@@ -153,8 +150,8 @@ def eye_pictures(
             head = look_at((ring * x, ring * y, UP), width=size, height=size)
             for right in (-APART / 2, APART / 2):
                 eye = replace(head, translation=head.translation - (right, 0, 0))
-                found.append((place, to_box_frame(eye, np.array(axes))[0], spread_blocks(size, size, i, enough)))
-    return found
+                pictures.append((place, to_box_frame(eye, np.array(axes))[0], spread_blocks(size, size, i, enough)))
+    return pictures
 
 
 def condition_views(
@@ -205,13 +202,13 @@ def near_cameras(size: int) -> list[Camera]:
 
 def texture_cameras(size: int) -> list[Camera]:
     """Return the cameras of a conversion's texture: the middle of the close view from the side."""
-    found = []
+    cameras = []
     for i in SIDE:
         whole = zoomed(default_views("test", size=size)[i], NEAR)
         edge = size // TEXTURED
         offset = (size - edge) // 2
-        found.append(replace(whole, cx=whole.cx - offset, cy=whole.cy - offset, width=edge, height=edge))
-    return found
+        cameras.append(replace(whole, cx=whole.cx - offset, cy=whole.cy - offset, width=edge, height=edge))
+    return cameras
 
 
 def texture_note(texture: Texture) -> str:
@@ -237,7 +234,7 @@ def score_conditions(
         for rule in (headset,) if view.place.where else rules:
             ours = picked(render(gaussians, view.camera, rule, blocks=view.blocks)[..., :3], view.blocks)
             errors.setdefault((rule, view.place), []).append(psnr(view.reference, ours))
-    found = [
+    conditions = [
         ViewingCondition(rule, *place[:2], float(np.mean(dbs)), place.where) for (rule, place), dbs in errors.items()
     ]
-    return sorted(found, key=lambda condition: condition.psnr)
+    return sorted(conditions, key=lambda condition: condition.psnr)

@@ -8,15 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera, default_views
-from vvgt_cli.cameras.blocks import FEW, Blocks, drawn_pixels, picked, spread_blocks
-from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.rules import INRIA, Rule
+from vvgt_cli.cameras import FEW, Blocks, Camera, default_views, drawn_pixels, picked, spread_blocks
+from vvgt_cli.gaussians import INRIA, Gaussians, Rule
 from vvgt_cli.progress import ProgressCallback
 
 if TYPE_CHECKING:
-    from vvgt_cli.dvr import RenderSettings, Scene
-    from vvgt_cli.dvr.render import Viewed
+    from vvgt_cli.dvr import RenderSettings, Scene, Viewed
     from vvgt_cli.images.metrics import Scores, ViewScore
     from vvgt_cli.splat.render import Shown
 
@@ -29,11 +26,11 @@ def scored_views(
 ) -> list[tuple[int, Camera, Blocks | None]]:
     """List number and camera of each scored test view, and the blocks of it that are drawn, None for all of it."""
     cameras = default_views("test", size=size)
-    found = []
+    views = []
     for i in sorted(range(len(cameras)) if only is None else only):
         blocks = spread_blocks(cameras[i].width, cameras[i].height, i)
-        found.append((i, cameras[i], None if perceptual and i in WHOLE else blocks))
-    return found
+        views.append((i, cameras[i], None if perceptual and i in WHOLE else blocks))
+    return views
 
 
 def test_view_pixels(size: int) -> int:
@@ -164,9 +161,9 @@ class Views:
         if self.weights is not None:
             return mean_psnr(self.images, self.pictures(gaussians, rule), self.weights)
         pairs = zip(self.images, self.pictures(gaussians, rule), strict=True)
-        found = np.array([psnr(view[..., :3], image[..., :3]) for view, image in pairs])
+        scores = np.array([psnr(view[..., :3], image[..., :3]) for view, image in pairs])
         seen = np.array([view[..., 3].max() > FOREGROUND for view in self.images])
-        return float(found[seen | ~seen.any()].mean())
+        return float(scores[seen | ~seen.any()].mean())
 
 
 def check_blocks(cameras: Sequence[Camera]) -> list[tuple[Camera, Blocks | None]]:

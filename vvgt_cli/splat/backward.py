@@ -122,7 +122,7 @@ def _moments_tile(
     stack: those of a chunk are written together.
     """
     fetched, sums = np.empty(CHUNK * FIELDS, np.float32), np.empty(_END, np.float32)
-    found = np.empty((CHUNK, SUMS), np.float32)
+    own = np.empty((CHUNK, SUMS), np.float32)
     for begin in range(0, entries.shape[0], CHUNK):
         if begin > 0 and all_ended(buf):
             for index in range(begin, entries.shape[0]):
@@ -149,11 +149,11 @@ def _moments_tile(
                 s6 += sums[_A3 + i]
                 s7 += sums[_A4 + i]
                 s8 += sums[_A5 + i]
-            found[index, 0], found[index, 1], found[index, 2], found[index, 3], found[index, 4] = s0, s1, s2, s3, s4
-            found[index, 5], found[index, 6], found[index, 7], found[index, 8] = s5, s6, s7, s8
+            own[index, 0], own[index, 1], own[index, 2], own[index, 3], own[index, 4] = s0, s1, s2, s3, s4
+            own[index, 5], own[index, 6], own[index, 7], own[index, 8] = s5, s6, s7, s8
         for index in range(count):
             for f in range(SUMS):
-                pairs[slots[begin + index], f] = found[index, f]
+                pairs[slots[begin + index], f] = own[index, f]
 
 
 @parallel_kernel(

@@ -35,11 +35,11 @@ def view_colors(
     """Write colours (K, 3) float32 as seen from the eye into ``out``, limited to what float32 holds."""
     for k in iterations(thread, means.shape[0]):
         x, y, z, _ = _toward(means, k, eye)
-        found = _terms(x, y, z)
+        basis = _terms(x, y, z)
         for c in range(3):
             total = np.float64(colors[k, c])
             for m in range(harmonics.shape[1]):
-                total += found[m] * harmonics[k, m, c]
+                total += basis[m] * harmonics[k, m, c]
             out[k, c] = min(max(total, -_LARGEST), _LARGEST)
 
 
@@ -63,12 +63,12 @@ def view_slopes(
             out_means[k] = 0.0
             continue
         x, y, z, inverse = _toward(means, k, eye)
-        found, bent = _terms(x, y, z), _term_slopes(x, y, z)
+        basis, bent = _terms(x, y, z), _term_slopes(x, y, z)
         g0 = g1 = g2 = 0.0
         for m in range(harmonics.shape[1]):
             by_term = 0.0
             for c in range(3):
-                out_harmonics[k, m, c] = found[m] * slopes[k, c]
+                out_harmonics[k, m, c] = basis[m] * slopes[k, c]
                 by_term += np.float64(harmonics[k, m, c]) * slopes[k, c]
             slope = bent[m]
             g0, g1, g2 = g0 + by_term * slope[0], g1 + by_term * slope[1], g2 + by_term * slope[2]
@@ -88,11 +88,11 @@ def deposit(thread: ThreadSlice, means: np.ndarray, eye: np.ndarray, values: np.
         if values[k, 0] == 0.0 and values[k, 1] == 0.0 and values[k, 2] == 0.0:
             continue
         x, y, z, _ = _toward(means, k, eye)
-        found = _terms(x, y, z)
+        basis = _terms(x, y, z)
         for c in range(3):
             out[k, 0, c] += values[k, c]
             for m in range(out.shape[1] - 1):
-                out[k, 1 + m, c] += found[m] * values[k, c]
+                out[k, 1 + m, c] += basis[m] * values[k, c]
 
 
 @parallel_kernel("f4:2 f8:1 f8:1 f4:3")
@@ -104,8 +104,8 @@ def deposit_squares(
         if weights[k] == 0.0:
             continue
         x, y, z, _ = _toward(means, k, eye)
-        found = _terms(x, y, z)
+        basis = _terms(x, y, z)
         for i in range(out.shape[1]):
-            first = weights[k] if i == 0 else weights[k] * found[i - 1]
+            first = weights[k] if i == 0 else weights[k] * basis[i - 1]
             for j in range(out.shape[1]):
-                out[k, i, j] += first if j == 0 else first * found[j - 1]
+                out[k, i, j] += first if j == 0 else first * basis[j - 1]

@@ -7,11 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from vvgt_cli.cameras import Camera
-from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.constants import NEAR
+from vvgt_cli.gaussians import INRIA, NEAR, Gaussians, Rule
 from vvgt_cli.gaussians.frames import axes_of, view_colors
 from vvgt_cli.gaussians.frames import rotations as rotations
-from vvgt_cli.gaussians.rules import INRIA, Rule
 
 
 def covariances(gaussians: Gaussians) -> np.ndarray:
@@ -74,7 +72,7 @@ def layers(gaussians: Gaussians, camera: Camera, rule: Rule = INRIA) -> Iterator
 
 def drawn_opacity(gaussians: Gaussians, flat: np.ndarray, rule: Rule) -> np.ndarray:
     """Return (K,) opacity by a rule for dilated covariances (K, 2, 2): compensated, 0 for what is skipped."""
-    opacity = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
+    opacity = gaussians.opacity
     if rule.compensate:
         own = np.linalg.det(flat - rule.dilation * np.eye(2))
         opacity = opacity * np.sqrt(np.maximum(own, 0) / np.linalg.det(flat))

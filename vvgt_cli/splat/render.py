@@ -7,11 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera
-from vvgt_cli.cameras.blocks import Blocks
-from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.constants import TILE
-from vvgt_cli.gaussians.rules import INRIA, Rule, rule_of
+from vvgt_cli.cameras import Blocks, Camera
+from vvgt_cli.gaussians import INRIA, TILE, Gaussians, Rule, rule_of
 
 
 @dataclass(frozen=True)

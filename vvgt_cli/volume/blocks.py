@@ -290,9 +290,9 @@ def any_case(path: Path) -> Path:
     """
     if path.is_file() or not path.parent.is_dir():
         return path
-    found = [p for p in path.parent.iterdir() if p.name.lower() == path.name.lower() and p.is_file()]
-    found = found if len(found) < 2 else [p for p in found if p.name.partition(".")[0] == path.name.partition(".")[0]]
-    return found[0] if len(found) == 1 else path
+    alike = [p for p in path.parent.iterdir() if p.name.lower() == path.name.lower() and p.is_file()]
+    alike = alike if len(alike) < 2 else [p for p in alike if p.name.partition(".")[0] == path.name.partition(".")[0]]
+    return alike[0] if len(alike) == 1 else path
 
 
 def data_file(header: Path, named: str, exact: bool = False) -> Path:
@@ -312,10 +312,10 @@ def data_file(header: Path, named: str, exact: bool = False) -> Path:
             f"{header.name}: its data file is {named!r}; expected a file in the header's own folder (copy or move "
             "it there and name it without a path)"
         )
-    found = any_case(target)
-    if not found.is_file() or (exact and found != target):
-        hint = "" if found == target else f" (rename {found.name})"
+    file = any_case(target)
+    if not file.is_file() or (exact and file != target):
+        hint = "" if file == target else f" (rename {file.name})"
         raise DataError(f"{header.name}: its data file {named!r} does not exist beside it; expected {target}{hint}")
-    if found != target:
-        warnings.warn(f"{header.name}: its data file {named!r} does not exist, {found.name} is read", stacklevel=2)
-    return found
+    if file != target:
+        warnings.warn(f"{header.name}: its data file {named!r} does not exist, {file.name} is read", stacklevel=2)
+    return file

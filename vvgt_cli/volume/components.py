@@ -34,12 +34,12 @@ def choose(
         SeveralArrays: several and none chosen.
         UsageError: none, or several, of the name.
     """
-    found = [k for k, name in enumerate(names) if wanted in (None, name)]
-    if len(found) == 1:
-        return found[0]
+    fits = [k for k, name in enumerate(names) if wanted in (None, name)]
+    if len(fits) == 1:
+        return fits[0]
     many = what.removesuffix("s") + "s"
     if wanted is not None:
-        number = f"{len(found)} {many}" if found else f"no {what}"
+        number = f"{len(fits)} {many}" if fits else f"no {what}"
         raise UsageError(f"{source}: {number} {wanted!r}; it has {listed(rows)}; {how}")
     if not names:
         raise DataError(f"{source}: no {what} of numbers; expected a volume")
@@ -128,8 +128,8 @@ def select_component(
             raise UsageError(f"{what}; leave out --component {component}")
         return contiguous(values[..., 0]), scaling
     if component is None or (component != "magnitude" and component not in range(n)):
-        found = "" if component is None else f", not component {component}"
-        text = f"{what}{found}; expected a scalar: try --component 0 to {n - 1}, or --component magnitude"
+        chosen = "" if component is None else f", not component {component}"
+        text = f"{what}{chosen}; expected a scalar: try --component 0 to {n - 1}, or --component magnitude"
         raise SeveralComponents(text, n, color and n in (3, 4)) if component is None else UsageError(text)
     if component == "magnitude":
         return magnitude(np.moveaxis(values, -1, 0), *scaling), (1.0, 0.0)

@@ -84,14 +84,14 @@ class Chunks:
         """Compute chunks; return each with its number."""
         dask: Any = importlib.import_module("dask")
         try:  # delayed: a chunk as it is, where an array's compute() copies it
-            found = dask.compute(*[self._array.blocks[number].to_delayed().item() for number in numbers])
+            computed = dask.compute(*[self._array.blocks[number].to_delayed().item() for number in numbers])
         except VvgtError:
             raise
         except Exception as error:  # whatever the functions in the graph raise
             text = " ".join(f"{type(error).__name__}: {error}".split())
             raise DataError(f"{self._name}: chunk {numbers[0]} or one after it cannot be computed ({text})") from error
         chunks = []
-        for number, values in zip(numbers, found, strict=True):
+        for number, values in zip(numbers, computed, strict=True):
             chunk = np.asarray(values)
             shape = tuple(ends[k + 1] - ends[k] for ends, k in zip(self._ends, number, strict=True))
             if chunk.shape != shape or chunk.dtype != self._array.dtype:

@@ -80,12 +80,12 @@ class HeaderFields(dict[str, str]):
 
     def dtype(self, key: str, text: str, aliases: Mapping[str, str] | None = None) -> np.dtype:
         """Return the type of values that a field names, as C or numpy does (see `type_of`), or raise DataError."""
-        found = type_of(text, aliases)
-        if found is None:
+        kind = type_of(text, aliases)
+        if kind is None:
             raise DataError(
                 f"{self.name}: {key} is {text[:40]!r}; expected a type of numbers such as uchar, short, uint16 or float"
             )
-        return found
+        return kind
 
 
 def fields_of_sections(path: Path) -> HeaderFields:

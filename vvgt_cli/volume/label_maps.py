@@ -29,11 +29,11 @@ def labels_in(volume: Volume) -> list[int]:
     if kind.kind in "iu" and kind.itemsize <= 2 and (volume.slope, volume.intercept) == (1, 0):
         counts, first = count_integers(volume)
         return [int(n) + first for n in np.flatnonzero(counts)]
-    found = np.empty(0)
+    distinct = np.empty(0)
     for _, slab in slabs(volume):
         values = np.unique(slab)
-        found = np.union1d(found, values[np.isfinite(values)].astype(np.float64))
-        values = whole_numbers(found, volume)
+        distinct = np.union1d(distinct, values[np.isfinite(values)].astype(np.float64))
+        values = whole_numbers(distinct, volume)
     return list(map(int, values))
 
 
@@ -111,7 +111,7 @@ class Extent:
 
 def extents_of(volume: Volume) -> dict[float, Extent]:
     """Return the voxels of each data value, slice by slice; voxels that are NaN have none."""
-    found: dict[float, Extent] = {}
+    extents: dict[float, Extent] = {}
     nx, ny, _ = volume.dims
     y, x = (index.ravel() for index in np.indices((ny, nx)))
     for z, plane in enumerate(planes(volume)):
@@ -123,13 +123,13 @@ def extents_of(volume: Volume) -> dict[float, Extent]:
             value = float(volume.slope * float(values[k]) + volume.intercept)
             low, high = (np.array([spans[0][end][k], spans[1][end][k], z]) for end in (0, 1))
             total = np.array([sums[0][k], sums[1][k], z * counts[k]], np.float64)
-            one = found.get(value)
+            one = extents.get(value)
             if one is None:
-                found[value] = Extent(int(counts[k]), total, low, high)
+                extents[value] = Extent(int(counts[k]), total, low, high)
                 continue
             one.count, one.total = one.count + int(counts[k]), one.total + total
             one.first, one.last = np.minimum(one.first, low), np.maximum(one.last, high)
-    return found
+    return extents
 
 
 def _numbered(plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

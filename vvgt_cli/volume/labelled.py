@@ -308,12 +308,12 @@ def _missing(values: np.ndarray, attributes: Mapping[str, Any], slope: float, in
 
 def _marks(attributes: Mapping[str, Any], key: str, dtype: np.dtype) -> list[Any]:
     """Return the numbers of an attribute, with the sign of ``_Unsigned`` as values have it; none where it is text."""
-    found = np.asarray(attributes.get(key, ())).reshape(-1)
-    if found.dtype.kind not in "iuf":
+    numbers = np.asarray(attributes.get(key, ())).reshape(-1)
+    if numbers.dtype.kind not in "iuf":
         return []
-    if "_Unsigned" in attributes and found.dtype.kind in "iu" and dtype.kind in "iu":
-        found = found.astype(dtype)  # wraps
-    return found.tolist()
+    if "_Unsigned" in attributes and numbers.dtype.kind in "iu" and dtype.kind in "iu":
+        numbers = numbers.astype(dtype)  # wraps
+    return numbers.tolist()
 
 
 def _unpacked(attributes: Mapping[str, Any], key: str, dtype: np.dtype) -> bool:
@@ -321,11 +321,11 @@ def _unpacked(attributes: Mapping[str, Any], key: str, dtype: np.dtype) -> bool:
 
     Fractions count so, too, whatever their type.
     """
-    found = np.asarray(attributes.get(key, ()))
+    limits = np.asarray(attributes.get(key, ()))
     scaling = [np.asarray(attributes[name]).dtype for name in ("scale_factor", "add_offset") if name in attributes]
-    if dtype.kind not in "iu" or found.dtype.kind != "f" or not found.size or not scaling:
+    if dtype.kind not in "iu" or limits.dtype.kind != "f" or not limits.size or not scaling:
         return False
-    return found.dtype == np.result_type(*scaling) or bool((found % 1 != 0).any())
+    return limits.dtype == np.result_type(*scaling) or bool((limits % 1 != 0).any())
 
 
 def _packed(limit: float, slope: float, intercept: float) -> float:

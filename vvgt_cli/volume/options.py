@@ -124,10 +124,10 @@ class ReadOptions:
 
 def parse_dtype(name: str, byte_order: str | None = None) -> np.dtype:
     """Return the type of a name of `DTYPES` or of C, by default little-endian; raise UsageError for others."""
-    found = type_of(name)
-    if found is None:
+    kind = type_of(name)
+    if kind is None:
         raise UsageError(f"--dtype {name}: expected one of {', '.join(DTYPES)}")
-    return found.newbyteorder(">" if byte_order == "big" else "<")
+    return kind.newbyteorder(">" if byte_order == "big" else "<")
 
 
 Box = tuple[tuple[int | None, int | None], ...]
@@ -166,9 +166,9 @@ def masked(volume: Volume, mask: Volume, stored: bool = False) -> Volume:
         DataError: a mask of another size, or one that keeps nothing (of a stored one only its blocks know).
     """
     if mask.dims != volume.dims:
-        found, wanted = (" x ".join(map(str, v.dims)) for v in (mask, volume))
+        given, wanted = (" x ".join(map(str, v.dims)) for v in (mask, volume))
         raise DataError(
-            f"--mask {mask.name}: {found} voxels; expected the {wanted} of {volume.name}: resample it onto that grid"
+            f"--mask {mask.name}: {given} voxels; expected the {wanted} of {volume.name}: resample it onto that grid"
         )
     kind = float_dtype(volume.data.dtype)
 

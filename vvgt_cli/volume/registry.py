@@ -136,10 +136,10 @@ def level_shapes(source: str, options: ReadOptions) -> list[tuple[int, ...]]:
         return remote(source, options)
     path = Path(source)
     if path.is_dir():
-        found = next((r for r in READERS if r.levels is not None and r.holds is not None and r.holds(path)), None)
+        reader = next((r for r in READERS if r.levels is not None and r.holds is not None and r.holds(path)), None)
     else:
-        found = _recognised(path, _head(path, source))[0] if path.is_file() else None
-    return [] if found is None or found.levels is None else found.levels(path, options)
+        reader = _recognised(path, _head(path, source))[0] if path.is_file() else None
+    return [] if reader is None or reader.levels is None else reader.levels(path, options)
 
 
 def _inner(source: str, options: ReadOptions) -> tuple[Path, ReadOptions]:
@@ -187,7 +187,7 @@ def _folder(path: Path, source: str) -> Reader:
 
 def _volumes_in(path: Path) -> dict[str, list[str]]:
     """Group the volume files in a folder (not in its folders) by format, known by their names or else their content."""
-    found: dict[str, list[str]] = {}
+    files: dict[str, list[str]] = {}
     for name in sorted(entry.name for entry in islice(os.scandir(path), LOOKED_AT) if entry.is_file()):
         reader = _by_name(path / name)
         if reader is None:
@@ -198,8 +198,8 @@ def _volumes_in(path: Path) -> dict[str, list[str]]:
                 continue
             reader = next((r for r in READERS if r.holds is not None and head and r.sniff and r.sniff(head)), None)
         if reader is not None:
-            found.setdefault(reader.name, []).append(name)
-    return found
+            files.setdefault(reader.name, []).append(name)
+    return files
 
 
 def _head(path: Path, source: str) -> bytes:
@@ -243,16 +243,16 @@ def _by_name(path: Path) -> Reader | None:
 def _find(path: Path, head: bytes, options: ReadOptions) -> Reader:
     """Find the reader of a file, or raise `DataError` with what else to do with it."""
     named = _by_name(path)
-    found, inner = _recognised(path, head)
-    if found is not None and named is not None and found.name in named.within:
-        found = named
-    raw_layout = options.dtype or parse_name(path.name) or (options.dims and not (found and found.resamples))
-    if found is not None and found is not named and raw_layout:
+    reader, inner = _recognised(path, head)
+    if reader is not None and named is not None and reader.name in named.within:
+        reader = named
+    raw_layout = options.dtype or parse_name(path.name) or (options.dims and not (reader and reader.resamples))
+    if reader is not None and reader is not named and raw_layout:
         return RAW  # a raw volume may begin with any bytes; where its layout is stated, believe that
-    if found is not None:
-        if inner != head and not any(suffix.endswith("gz") for suffix in found.suffixes):
-            raise DataError(f"{path}: a gzip-compressed {found.name} file; unpack it first (gunzip)")
-        return found
+    if reader is not None:
+        if inner != head and not any(suffix.endswith("gz") for suffix in reader.suffixes):
+            raise DataError(f"{path}: a gzip-compressed {reader.name} file; unpack it first (gunzip)")
+        return reader
     if options.dims and (options.dtype or named is None or not named.resamples):
         return RAW
     by_name = named is not None and (named.by_name or named.nameable)

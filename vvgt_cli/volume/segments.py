@@ -39,19 +39,19 @@ def segments_in(read: Callable[[], Iterable[Segment]], source: str) -> tuple[Seg
 
     A table that is damaged, or gives one number two names, hides no volume: warn, and return no segments.
     """
-    found: dict[int, Segment] = {}
+    segments: dict[int, Segment] = {}
     try:
         for one in sorted(read(), key=lambda one: one.number):
             values = (*(one.color or ()), 1.0 if one.opacity is None else one.opacity)
             if abs(one.number) > MAX_NUMBER or not all(0 <= value <= 1 for value in values):
                 raise ValueError(f"label {one.number}, colour and opacity {values}")
-            if found.setdefault(one.number, one).name != one.name:
-                raise ValueError(f"label {one.number} is {found[one.number].name[:40]!r} and {one.name[:40]!r}")
+            if segments.setdefault(one.number, one).name != one.name:
+                raise ValueError(f"label {one.number} is {segments[one.number].name[:40]!r} and {one.name[:40]!r}")
     except DAMAGED as error:
         text = " ".join(str(error).split())[:200] or type(error).__name__
         warnings.warn(f"{source}: its own table of labels is damaged and not used ({text})", stacklevel=2)
         return ()
-    return tuple(found.values())
+    return tuple(segments.values())
 
 
 def segments_of_xml(text: bytes) -> list[Segment]:
@@ -59,10 +59,10 @@ def segments_of_xml(text: bytes) -> list[Segment]:
 
     Workbench and TotalSegmentator write it into extensions of NIfTI. Raise ValueError or ParseError for other texts.
     """
-    found = []
+    segments = []
     for one in fromstring(text).iter("Label"):
         number = int(one.get("Key", ""))
         red, green, blue, alpha = (float(one.get(key, "1")) for key in ("Red", "Green", "Blue", "Alpha"))
         color = (red, green, blue)
-        found.append(Segment(number, (one.text or "").strip(), color, opacity=alpha if number else 0.0))
-    return found
+        segments.append(Segment(number, (one.text or "").strip(), color, opacity=alpha if number else 0.0))
+    return segments

@@ -140,7 +140,7 @@ def axis_words(axes: np.ndarray, space: str | None) -> list[str]:
     ``axes`` (3, 3) are unit vectors in columns. One more than half a degree off the nearest world axis says by how
     many.
     """
-    found = []
+    words = []
     for column in axes.T:
         k = int(np.abs(column).argmax())
         along = column[k] > 0
@@ -150,8 +150,8 @@ def axis_words(axes: np.ndarray, space: str | None) -> list[str]:
             ends = _OPPOSITE[space[k]], space[k]
             word = "-".join(ends if along else ends[::-1])
         off = float(np.degrees(np.arccos(min(abs(column[k]), 1.0))))
-        found.append(f"{word} ({off:.0f} degrees off)" if off > 0.5 else word)
-    return found
+        words.append(f"{word} ({off:.0f} degrees off)" if off > 0.5 else word)
+    return words
 
 
 def shear_text(axes: np.ndarray) -> str:

@@ -84,8 +84,8 @@ class Stored:
             )
             try:
                 self._read(part)
-            except Exception as found:
-                text = " ".join(str(found).split()) or type(found).__name__
+            except Exception as cause:
+                text = " ".join(str(cause).split()) or type(cause).__name__
                 return DataError(
                     f"{self.source}: chunk {index} (z, y, x) is damaged ({text}); fetch it again, or remove it for the "
                     "format's fill value"
@@ -111,11 +111,11 @@ def stored_or_loaded(
     stored: bool,
 ) -> Any:  # fmt: skip
     """Return a `Stored`, or its values if ``stored`` is False; raise DataError if they do not fit in memory."""
-    found = Stored(read, dtype, tuple(shape), chunks, source)
+    values = Stored(read, dtype, tuple(shape), chunks, source)
     if stored:
-        return found
-    check_memory(found.nbytes, source, IN_BLOCKS)
-    return found[:]
+        return values
+    check_memory(values.nbytes, source, IN_BLOCKS)
+    return values[:]
 
 
 def put_overlap(out: np.ndarray, first: Sequence[int], block: np.ndarray, at: Sequence[int]) -> None:
@@ -195,23 +195,23 @@ def give_back(data: np.ndarray) -> None:
 
 def values_at(volume: Volume, index: np.ndarray) -> np.ndarray:
     """Read the data values (n,) float64 of voxels ``index`` (n, 3) int, (x, y, z), which lie in the volume."""
-    found = np.empty(len(index))
+    values = np.empty(len(index))
     if not len(index):
-        return found
+        return values
     edge = np.array([max(c, POINTS_BOX) for c in chunks_of(volume)[::-1]]) if isinstance(volume.data, Stored) else None
     if edge is None:
         x, y, z = index.T
         stored: np.ndarray = volume.data[z, y, x]
-        found[:] = stored
-        return volume.slope * found + volume.intercept
+        values[:] = stored
+        return volume.slope * values + volume.intercept
     boxes, which = np.unique(index // edge, axis=0, return_inverse=True)
     order = np.argsort(which.ravel(), kind="stable")
     for box, rows in zip(boxes, np.split(order, np.cumsum(np.bincount(which.ravel()))[:-1]), strict=True):
         lo = box * edge
         part = read_block(volume, lo, np.minimum(lo + edge, volume.dims))
         x, y, z = (index[rows] - lo).T
-        found[rows] = part[z, y, x]
-    return volume.slope * found + volume.intercept
+        values[rows] = part[z, y, x]
+    return volume.slope * values + volume.intercept
 
 
 def planes(volume: Volume) -> Iterator[np.ndarray]:

@@ -66,10 +66,10 @@ class ClosedFormStage(Stage):
             start = work.field.pyramid(options, run.console.bar(self.name))
             if not len(start.gaussians):
                 raise NothingVisible(source.volume.name, source.name)
-            found = len(start.gaussians)
+            made = len(start.gaussians)
             start, removed = thinned(start)
             stage.note = f"{len(start.gaussians)} Gaussians" + f" ({fit.init})" * (fit.init != INIT)
-            if start.form is not None and not removed and found < NEARLY * fit.max_gaussians:
+            if start.form is not None and not removed and made < NEARLY * fit.max_gaussians:
                 stage.note += f", no more: {bound(start.form)}"
         if removed:
             run.skip(f"{removed} Gaussians", TOO_FAINT)
@@ -82,11 +82,11 @@ def thinned(start: Start) -> tuple[Start, int]:
     """Return a closed form with fewer Gaussians where they are faint, and the number of Gaussians removed."""
 
     def cut(budget: int) -> tuple[Start, int, bool]:
-        found, form = start, start.form
+        shorter, form = start, start.form
         if form is not None and budget < form.budget:
             form = replace(form, budget=budget)
-            found = replace(start, form=form, gaussians=form.gaussians())
-        return found, len(found.gaussians), bool(np.median(found.gaussians.opacity_logits) < FAINT_LOGIT)
+            shorter = replace(start, form=form, gaussians=form.gaussians())
+        return shorter, len(shorter.gaussians), bool(np.median(shorter.gaussians.opacity_logits) < FAINT_LOGIT)
 
     return halve_budget_while_faint(0 if start.form is None else start.form.budget, cut)
 

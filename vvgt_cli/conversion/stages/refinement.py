@@ -10,15 +10,13 @@ from typing import ClassVar
 
 import numpy as np
 
-from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.conversion.request import FitOptions, Limits
 from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.defaults import FEWEST_STEPS, MAX_STEPS, METHOD, STEPS
 from vvgt_cli.errors import DeviceFailed
 from vvgt_cli.field.workload import Workload, view_edge
-from vvgt_cli.gaussians import Gaussians, as_stored
-from vvgt_cli.gaussians.constants import MIN_ALPHA
+from vvgt_cli.gaussians import MIN_ALPHA, Gaussians, as_stored
 from vvgt_cli.refine import OptimizeOptions, OptimizeRecord, optimize
 from vvgt_cli.score.record import Run
 from vvgt_cli.score.views import Views
@@ -181,8 +179,8 @@ def without_undrawn(gaussians: Gaussians, size: int, dilation: float = 0.0) -> G
 
     Arguments are those of `widen_small`.
     """
-    found, kept = widen_small(gaussians, size, dilation)
-    return found.take(kept) if kept.any() else gaussians
+    widened, kept = widen_small(gaussians, size, dilation)
+    return widened.take(kept) if kept.any() else gaussians
 
 
 def widen_small(gaussians: Gaussians, size: int, dilation: float = 0.0) -> tuple[Gaussians, np.ndarray]:
@@ -193,13 +191,11 @@ def widen_small(gaussians: Gaussians, size: int, dilation: float = 0.0) -> tuple
         size: pixels along the edge of the screen that the file is made for; `SMALLEST` is the least width there.
         dilation: px^2 of dilation that the mass includes; 0 for viewers that compensate theirs.
     """
-    opacity = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
-    camera = default_views("check", 1, size=size)[0]
-    pixel = float(np.linalg.norm(camera.position)) / camera.fx
+    pixel = pixel_width(size)
     width = np.exp(gaussians.log_scales.max(axis=1).astype(np.float64))
     widening = np.maximum(SMALLEST * pixel / width, 1)
     beside = dilation * (pixel / width) ** 2
-    opacity = np.clip(opacity / ((widening**2 + beside) / (1 + beside)), 1e-7, 1 - 1e-7)
+    opacity = np.clip(gaussians.opacity / ((widening**2 + beside) / (1 + beside)), 1e-7, 1 - 1e-7)
     logits = np.where(widening > 1, np.log(opacity / (1 - opacity)), gaussians.opacity_logits)
     scales = gaussians.log_scales + np.log(widening)[:, None]
     return replace(gaussians, log_scales=scales, opacity_logits=logits), opacity >= MIN_ALPHA

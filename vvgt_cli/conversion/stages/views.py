@@ -7,20 +7,16 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera, default_views
-from vvgt_cli.cameras.blocks import Blocks, spread_blocks
-from vvgt_cli.cameras.sets import SET_VIEWS
+from vvgt_cli.cameras import SET_VIEWS, Blocks, Camera, default_views, pixel_width, spread_blocks
 from vvgt_cli.conversion.request import FitOptions
 from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.field.field import Picture
 from vvgt_cli.field.workload import Workload, view_edge
-from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.rules import Rule
+from vvgt_cli.gaussians import Gaussians, Rule
 from vvgt_cli.score.views import VIEW_BYTES, Views, check_blocks, render_check_views
 
 if TYPE_CHECKING:
-    from vvgt_cli.dvr import RenderSettings, Scene
-    from vvgt_cli.dvr.render import Viewed
+    from vvgt_cli.dvr import RenderSettings, Scene, Viewed
 
 MAX_VIEWS = 120  # maximal number of training views of gradient descent, in whole sets
 VIEWS_A_STEP = 0.65, 0.85  # small and large views per step: fewer overfit, more cost steps (docs/log/refinement.md)
@@ -60,8 +56,7 @@ class CheckViews(Stage):
 
     def views(self, fit: FitOptions) -> list[Picture]:
         """List the check views."""
-        from vvgt_cli.dvr import RenderSettings
-        from vvgt_cli.dvr.render import FIT_VIEWS
+        from vvgt_cli.dvr import FIT_VIEWS, RenderSettings
 
         settings = RenderSettings() if self.fine else FIT_VIEWS
         return [
@@ -71,8 +66,7 @@ class CheckViews(Stage):
 
     def run(self, work: Work) -> None:
         """Render the check views, unless that is done."""
-        from vvgt_cli.dvr import RenderSettings
-        from vvgt_cli.dvr.render import FIT_VIEWS
+        from vvgt_cli.dvr import FIT_VIEWS, RenderSettings
 
         if work.check is not None:
             return
@@ -114,16 +108,15 @@ class TrainingViews(Stage):
         """List the views, with one ray per pixel, and the pictures that decide whether that is enough."""
         from vvgt_cli.dvr.render import FIT_VIEWS
 
-        found = [Picture(camera, FIT_VIEWS) for camera in default_views("train", self.count, size=self.edge)]
+        pictures = [Picture(camera, FIT_VIEWS) for camera in default_views("train", self.count, size=self.edge)]
         if self.fitted:
             camera, blocks = _probe(self.edge)
-            found += [Picture(camera, settings, blocks) for settings in _candidates(_spread(self.edge / fit.screen))]
-        return found
+            pictures += [Picture(camera, settings, blocks) for settings in _candidates(_spread(self.edge / fit.screen))]
+        return pictures
 
     def run(self, work: Work) -> None:
         """Render the views, as finely as the Gaussians need."""
-        from vvgt_cli.dvr import render_views
-        from vvgt_cli.dvr.render import FIT_VIEWS
+        from vvgt_cli.dvr import FIT_VIEWS, render_views
 
         footprint = self.edge / work.fit.screen
         work.train_rule = work.rule.at(footprint)
@@ -152,8 +145,7 @@ def _probe(size: int) -> tuple[Camera, Blocks | None]:
 
 def _candidates(footprint: float) -> tuple[RenderSettings, RenderSettings, RenderSettings]:
     """Return settings of adaptive rays, and of one ray per pixel with longer and shorter steps."""
-    from vvgt_cli.dvr import RenderSettings
-    from vvgt_cli.dvr.render import FIT_VIEWS
+    from vvgt_cli.dvr import FIT_VIEWS, RenderSettings
 
     return RenderSettings(footprint=footprint), FIT_VIEWS, RenderSettings(samples=1)
 
@@ -193,8 +185,7 @@ def suits_small_views(gaussians: Gaussians, size: int) -> bool:
     They are where the median of the middle standard deviations is above `WIDE` px of a view twice as large, and bodies
     are not opaque, since only the edges of opaque ones are seen.
     """
-    camera = default_views("check", 1, size=2 * view_edge(size, small=True))[0]
-    pixel = float(np.linalg.norm(camera.position)) / camera.fx
+    pixel = pixel_width(2 * view_edge(size, small=True))
     middle = np.exp(np.median(gaussians.log_scales, axis=1))  # of three
     solid = np.median(gaussians.opacity_logits) > np.log(SOLID / (1 - SOLID))
     return bool(np.median(middle) > WIDE * pixel and not solid)

@@ -1,7 +1,8 @@
 """Binary glTF with KHR_gaussian_splatting: float32 attributes of point meshes, without quantisation.
 
-The data are those of the `.ply`, in its axes. The root node rotates them by 180 degrees about z, to glTF's +y up, and
-places them in the world in metres, where that is known. Several clouds are nodes below it, in groups.
+The data are those of the `.ply`, rotated by 180 degrees about z, to glTF's +y up: means, rotations and harmonics, since
+programs turn nodes without their harmonics. The root node, which does not turn, places them in the world in metres,
+where that is known. Several clouds are nodes below it, in groups.
 """
 
 from __future__ import annotations
@@ -9,14 +10,25 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.gaussians.formats.nodes import ROOT, Node, common_comments, group_names, offset_in, placed, report_off
+from vvgt_cli.gaussians.formats.nodes import (
+    HALF_TURN,
+    ROOT,
+    Node,
+    common_comments,
+    group_names,
+    offset_in,
+    placed,
+    report_off,
+)
 from vvgt_cli.gaussians.formats.splats import Splats, joined, log_scales_of, logits_of, opacities_of
 from vvgt_cli.gaussians.frames import rotations
+from vvgt_cli.gaussians.ply import f_dc_to_colors
 from vvgt_cli.version import VERSION
 
 EXTENSION, VISIBILITY = "KHR_gaussian_splatting", "KHR_node_visibility"
@@ -26,14 +38,16 @@ _KERNEL = {
 }  # fmt: skip
 _HIDDEN = {VISIBILITY: {"visible": False}}
 _MAGIC, _JSON, _BINARY = 0x46546C67, 0x4E4F534A, 0x004E4942
-_FLOAT, _ARRAY, _POINTS = 5126, 34962, 0
+_FLOAT, _USHORT, _ARRAY, _POINTS = 5126, 5123, 34962, 0
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
-_HALF_TURN = [0.0, 0.0, 1.0, 0.0]  # about z, (x, y, z, w)
+_TURN = np.diag([*np.diag(HALF_TURN), 1.0])
+_ORDERS = np.array([m for degree in (1, 2, 3) for m in range(-degree, degree + 1)])
+_SIGNS = np.where(_ORDERS % 2, -1, 1).astype(np.float32)  # of harmonics, by half a turn about z
 
 
 def glb(nodes: Sequence[Node], name: str) -> bytes:
     """Encode clouds as a `.glb` with a node each, in groups, below the root, which is a cloud without a name itself."""
-    comments = common_comments(nodes)
+    comments, nodes = common_comments(nodes), [replace(node, splats=_turned(node.splats)) for node in nodes]
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": f"vvgt {VERSION}", "extras": {"comments": list(comments)}},
         "extensionsUsed": [EXTENSION, *([] if all(node.visible for node in nodes) else [VISIBILITY])],
@@ -61,14 +75,28 @@ def glb(nodes: Sequence[Node], name: str) -> bytes:
 
 
 def _root(comments: tuple[str, ...], name: str) -> dict[str, Any]:
-    """Return the node that places the Gaussians in the world."""
+    """Return the node that places the turned Gaussians in the world."""
     place = placed(comments, name)
-    node: dict[str, Any] = {"name": ROOT, "rotation": _HALF_TURN}
+    node: dict[str, Any] = {"name": ROOT}
     if place.world is not None:
         node |= {"translation": place.translation.tolist(), "scale": [place.scale] * 3}
         extras = {"space": place.space, "unit": place.unit, "worldFromScene": place.world.ravel().tolist()}
         node["extras"] = extras  # the matrix is row-major
     return node
+
+
+def _turned(splats: Splats, back: bool = False) -> Splats:
+    """Return the columns rotated by 180 degrees about z, or ``back``, with the same comments."""
+    w, x, y, z = splats.quaternions.T if back else -splats.quaternions.T
+    signs, turn = _SIGNS[: splats.f_rest.shape[1], None], np.stack([z, y, -x, -w], axis=1)
+    return replace(splats, means=splats.means @ HALF_TURN.astype("f4"), quaternions=turn, f_rest=signs * splats.f_rest)
+
+
+def _fallback(splats: Splats) -> np.ndarray:
+    """Return (K, 4) uint16: colours without harmonics, in linear light as glTF has it, and opacities, of 65,535."""
+    shown = np.clip(f_dc_to_colors(splats.f_dc), 0, 1)
+    light = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
+    return np.rint(65535 * np.column_stack([light, opacities_of(splats.logits)])).astype("<u2")
 
 
 def _child(document: dict[str, Any], parent: int, node: dict[str, Any]) -> int:
@@ -84,6 +112,7 @@ def _mesh(document: dict[str, Any], arrays: list[np.ndarray], name: str, splats:
     accessors = document["accessors"]
     columns = {
         "POSITION": splats.means,
+        "COLOR_0": _fallback(splats),
         f"{EXTENSION}:ROTATION": splats.quaternions[:, [1, 2, 3, 0]],
         f"{EXTENSION}:SCALE": np.exp(splats.log_scales.astype(np.float64)),
         f"{EXTENSION}:OPACITY": opacities_of(splats.logits)[:, None],
@@ -95,9 +124,10 @@ def _mesh(document: dict[str, Any], arrays: list[np.ndarray], name: str, splats:
     bounds = {"min": splats.means.min(axis=0).tolist(), "max": splats.means.max(axis=0).tolist()}
     start = sum(array.nbytes for array in arrays)
     for attribute, column in columns.items():
-        array = np.ascontiguousarray(column, "<f4")
-        view, kind = len(accessors), _TYPES[array.shape[1]]
-        accessor = {"bufferView": view, "componentType": _FLOAT, "count": len(array), "type": kind}
+        packed = attribute == "COLOR_0"
+        array = np.ascontiguousarray(column, "<u2" if packed else "<f4")
+        accessor = {"bufferView": len(accessors), "count": len(array), "type": _TYPES[array.shape[1]]}
+        accessor |= {"componentType": _USHORT, "normalized": True} if packed else {"componentType": _FLOAT}
         accessors.append(accessor | (bounds if attribute == "POSITION" else {}))
         document["bufferViews"].append({"buffer": 0, "byteOffset": start, "byteLength": array.nbytes, "target": _ARRAY})
         arrays.append(array)
@@ -149,8 +179,8 @@ def _read(content: bytes, name: str) -> Splats:
         on = on and shown
         open_nodes += [(child, root, place, on) for child in reversed(node.get("children", []))]
         if "mesh" in node:
-            offset = offset_in(root, place, comments, name)
-            found.append(_columns(document, binary, node["mesh"], comments).moved(offset))
+            offset = offset_in(root @ _TURN, place @ _TURN, comments, name)
+            found.append(_turned(_columns(document, binary, node["mesh"], comments), back=True).moved(offset))
             off += [] if on else [str(node.get("name", number))]
     report_off(name, off)
     return joined(found)

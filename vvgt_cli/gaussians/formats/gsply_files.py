@@ -10,6 +10,7 @@ from __future__ import annotations
 import gzip
 import struct
 import tempfile
+import warnings
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -154,8 +155,8 @@ def _comments(content: bytes) -> list[str]:
 def _columns(data: Any, comments: list[str]) -> Splats:
     count = len(data.means)
     rest = np.zeros((count, 0, 3)) if data.shN is None else np.reshape(data.shN, (count, -1, 3))
-    found = (data.means, data.scales, data.quats, np.reshape(data.opacities, count), data.sh0, rest)
-    means, log_scales, quaternions, logits, f_dc, f_rest = (np.array(column, np.float32) for column in found)
+    columns = (data.means, data.scales, data.quats, np.reshape(data.opacities, count), data.sh0, rest)
+    means, log_scales, quaternions, logits, f_dc, f_rest = (np.array(column, np.float32) for column in columns)
     return Splats(means, log_scales, quaternions, logits, f_dc, f_rest, tuple(comments))
 
 
@@ -167,6 +168,7 @@ _OLD = struct.Struct("<4sIIBBBx")  # of versions 1 to 3
 _RECORD, _SIZES = struct.Struct("<II"), struct.Struct("<QQ")
 _RECORDS = 2  # flag
 _LEVEL = 12  # of Zstandard
+_COEFFICIENTS = {**HARMONICS, 4: 24}  # of version 4
 
 
 def library(source: str) -> Any:
@@ -176,7 +178,7 @@ def library(source: str) -> Any:
 
 def _lengths(count: int, degree: int) -> list[int]:
     """Return the sizes in bytes of centres, opacities, colours, scales, rotations and harmonics."""
-    return [length * count for length in (9, 1, 3, 3, 4, 3 * HARMONICS[degree]) if length]
+    return [length * count for length in (9, 1, 3, 3, 4, 3 * _COEFFICIENTS[degree]) if length]
 
 
 def from_version_3(content: bytes, comments: tuple[str, ...], name: str) -> bytes:
@@ -205,11 +207,11 @@ def to_version_3(content: bytes, name: str) -> tuple[bytes, list[str]]:
         _, version, count, degree, fraction, flags, streams, table = _HEAD.unpack_from(content)
     except struct.error:
         raise DataError(f"{name}: {len(content)} bytes; expected an .spz of version 4, whose header has 32") from None
-    lengths = _lengths(count, degree) if degree in HARMONICS else []
+    lengths = _lengths(count, degree) if degree in _COEFFICIENTS else []
     if version != 4 or streams != len(lengths) or not _HEAD.size <= table <= len(content) - streams * _SIZES.size:
         raise DataError(
             f"{name}: version {version}, degree {degree}, {streams} streams, table at {table} of {len(content)} bytes; "
-            "expected an .spz of version 4 with harmonics of degree 0 to 3"
+            "expected an .spz of version 4 with harmonics of degree 0 to 4"
         )
     check_memory(ROW_BYTES * count, f"{name}: {count:,} Gaussians", "a standard .ply, which is mapped, not loaded")
     zstd, start, body = library(name), table + streams * _SIZES.size, []
@@ -227,6 +229,9 @@ def to_version_3(content: bytes, name: str) -> tuple[bytes, list[str]]:
             comments = payload.decode("ascii", "replace").splitlines()
         if kind == AXES and payload[:1] != bytes([RIGHT_DOWN_FRONT]):
             raise DataError(f"{name}: axes of kind {payload[:1].hex()}; expected right, down, front as in a .ply (06)")
+    if degree > 3:
+        warnings.warn(f"{name}: harmonics of degree 4 are left out", stacklevel=2)
+        degree, body[-1] = 3, np.frombuffer(body[-1], "u1").reshape(count, -1)[:, : 3 * HARMONICS[3]].tobytes()
     front = _OLD.pack(MAGIC, 3, count, degree, fraction, flags & 1)
     return gzip.compress(front + b"".join(body), 1, mtime=0), comments
 
@@ -234,9 +239,9 @@ def to_version_3(content: bytes, name: str) -> tuple[bytes, list[str]]:
 def _unpacked(zstd: Any, part: bytes, length: int, name: str) -> bytes:
     """Decompress a stream; raise DataError below ``length`` bytes, seen by the unchanged end of the buffer."""
     for before in (b"\0", b"\xff"):
-        found = bytes(zstd.decompress(part, bytearray(before * length)))
-        if found[-1:] != before:
-            return found
+        content = bytes(zstd.decompress(part, bytearray(before * length)))
+        if content[-1:] != before:
+            return content
     raise DataError(f"{name}: truncated; expected {length} bytes by the file's table")
 
 

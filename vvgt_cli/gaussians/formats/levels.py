@@ -39,8 +39,8 @@ def split_name(name: str | Path) -> tuple[Path, str | None] | None:
 
 def by_view(name: str | Path) -> Path | None:
     """Return the manifest if a name ends in `#view`, else None."""
-    found = split_name(name)
-    return found[0] if found is not None and found[1] == VIEW else None
+    parts = split_name(name)
+    return parts[0] if parts is not None and parts[1] == VIEW else None
 
 
 @dataclass
@@ -118,7 +118,7 @@ class StreamedLevels:
         name = self.path.parent / self._manifest["filenames"][file]
         try:
             meta = json.loads(name.read_bytes())
-            found = splats_in(meta, lambda image: (name.parent / Path(image).name).read_bytes(), str(name))
+            splats = splats_in(meta, lambda image: (name.parent / Path(image).name).read_bytes(), str(name))
         except FileNotFoundError as error:
             raise DataError(f"{self.path}: {error.filename} is missing; expected the whole folder") from None
         except (OSError, ValueError) as error:
@@ -126,8 +126,8 @@ class StreamedLevels:
             raise DataError(f"{name}: damaged ({text}); expected SOG's {name.name}") from None
         for key in keys:
             _, offset, count = key
-            if offset + count > len(found):
+            if offset + count > len(splats):
                 raise DataError(
-                    f"{self.path}: a node has rows to {offset + count} of file {file}, which has {len(found)}"
+                    f"{self.path}: a node has rows to {offset + count} of file {file}, which has {len(splats)}"
                 )
-            self._cached[key] = found.take(np.arange(offset, offset + count))
+            self._cached[key] = splats.take(np.arange(offset, offset + count))

@@ -48,16 +48,16 @@ class Node:
 
 def group_names(nodes: Sequence[Node]) -> dict[tuple[str, ...], str]:
     """Return a name for each group, by its path and in order: parents first, no two and none that a node has."""
-    taken, found = {ROOT, *(node.name for node in nodes)}, dict[tuple[str, ...], str]()
+    taken, named = {ROOT, *(node.name for node in nodes)}, dict[tuple[str, ...], str]()
     for path in (node.parents[:depth] for node in nodes for depth in range(1, len(node.parents) + 1)):
-        if path in found:
+        if path in named:
             continue
         name = path[-1]
         while name in taken:
             name += " group"
-        found[path] = name
+        named[path] = name
         taken.add(name)
-    return found
+    return named
 
 
 def common_comments(nodes: Sequence[Node]) -> tuple[str, ...]:
@@ -128,8 +128,8 @@ def offset_in(root: np.ndarray, place: np.ndarray, comments: tuple[str, ...], na
         same_place(one, comments, name)
     if np.array_equal(root, place):
         return np.zeros(3)
-    found: np.ndarray = (np.linalg.inv(root) @ place)[:3, 3]
-    return found
+    offset: np.ndarray = (np.linalg.inv(root) @ place)[:3, 3]
+    return offset
 
 
 def same_place(matrix: np.ndarray, comments: tuple[str, ...], name: str) -> None:
@@ -137,6 +137,6 @@ def same_place(matrix: np.ndarray, comments: tuple[str, ...], name: str) -> None
     expected = placed(comments, name).matrix(), Placed(1.0, np.zeros(3)).matrix()
     if not any(np.allclose(matrix, one, rtol=1e-5, atol=1e-6 * np.abs(one[:3]).max()) for one in expected):
         raise DataError(
-            f"{name}: its Gaussians were moved by another program; expected the placement that vvgt writes (rotated by "
-            "180 degrees about z, in metres where their unit is known)"
+            f"{name}: its Gaussians were moved by another program; expected the placement that vvgt writes (+y up, in "
+            "metres where their unit is known)"
         )

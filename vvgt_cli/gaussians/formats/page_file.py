@@ -151,8 +151,8 @@ def farthest(places: np.ndarray) -> list[list[float]]:
     towards = np.array([d for d in product(range(-2, 3), repeat=3) if any(d)]).T
     if not len(places):
         return []
-    found: list[list[float]] = places[np.unique((places @ towards).argmax(axis=0))].round(3).tolist()
-    return found
+    chosen: list[list[float]] = places[np.unique((places @ towards).argmax(axis=0))].round(3).tolist()
+    return chosen
 
 
 def _visible(clouds: Sequence[Splats]) -> np.ndarray:
@@ -169,7 +169,7 @@ def _visible(clouds: Sequence[Splats]) -> np.ndarray:
 def rule_parameters(splats: Splats) -> dict[str, Any]:
     """Return the viewer's parameters for the rendering rule that the file names, or for the default one."""
     matches = (_RULE.match(line) for line in splats.comments)
-    rule = RULES.get(next((found[1] for found in matches if found), ""), INRIA)
+    rule = RULES.get(next((match[1] for match in matches if match), ""), INRIA)
     return {
         "dilation": rule.dilation, "compensate": rule.compensate, "shifted": rule.shifted,
         "reach": min(rule.reach, ENGINE_REACH),
@@ -214,10 +214,10 @@ def _text(title: str, scene: Mapping[str, Any], elements: str) -> str:
 
 def policy(text: str, source: str = "") -> str:
     """Return a page's content security policy, by hashes; ``source``, as "'self'", is where it loads files from."""
-    scripts = [found.encode("utf-8") for found in _SCRIPTS.findall(text)]
+    scripts = [part.encode("utf-8") for part in _SCRIPTS.findall(text)]
     if 'id="program"' in text:
         scripts.append(gzip.decompress(asset(PROGRAM)))
-    styles = [found.encode("utf-8") for found in _STYLES.findall(text)]
+    styles = [part.encode("utf-8") for part in _STYLES.findall(text)]
     script, style = (" ".join(f"'sha256-{_digest(one)}'" for one in some) for some in (scripts, styles))
     also = f"{source} " if source else ""
     return (
@@ -276,8 +276,8 @@ def iframe(content: bytes, name: str) -> str:
 
 def title_of(name: str, comments: Iterable[str] = ()) -> str:
     """Return the title that a file states, else its name without folder and ending."""
-    for found in filter(None, map(_TITLE.match, comments)):
-        return str(json.loads(found[1]))
+    for match in filter(None, map(_TITLE.match, comments)):
+        return str(json.loads(match[1]))
     return re.split(r"[/\\]", name)[-1].removesuffix(".html")
 
 
@@ -287,9 +287,9 @@ def read_html(content: bytes, name: str) -> Splats:
     Raises:
         DataError: the page is not from vvgt, or holds several clouds.
     """
-    found = _SPLATS.findall(content)
-    if not found:
+    clouds = _SPLATS.findall(content)
+    if not clouds:
         raise DataError(f"{name}: a page without Gaussians; expected one that vvgt wrote")
-    if len(found) > 1:
-        raise DataError(f"{name}: a page of {len(found)} clouds of Gaussians; expected one: try the .ply of one cloud")
-    return read_compressed_ply(base64.b64decode(found[0]), name)
+    if len(clouds) > 1:
+        raise DataError(f"{name}: a page of {len(clouds)} clouds of Gaussians; expected one: try the .ply of one cloud")
+    return read_compressed_ply(base64.b64decode(clouds[0]), name)

@@ -25,9 +25,9 @@ class StoredFrame(NamedTuple):
 
 def stored_frames(clouds: Sequence[tuple[str, Splats]]) -> list[StoredFrame]:
     """Return all frames (name, columns), those that share rows with the last whole frame as differences."""
-    clouds, found = _of_one_length(clouds), list[StoredFrame]()
-    while len(found) < len(clouds):
-        first = len(found)
+    clouds, stored = _of_one_length(clouds), list[StoredFrame]()
+    while len(stored) < len(clouds):
+        first = len(stored)
         key = clouds[first][1]
         changed = [_changed(key, splats) for _, splats in clouds[first + 1 :]]
         count = next((k for k, rows in enumerate(changed) if rows is None), len(changed))
@@ -37,10 +37,10 @@ def stored_frames(clouds: Sequence[tuple[str, Splats]]) -> list[StoredFrame]:
             order = order[np.argsort(ever[order], kind="stable")]  # unchanged Gaussians first
         name, splats = clouds[first]
         base = compressed_ply(splats, name, order)
-        found.append(StoredFrame(base, None))
+        stored.append(StoredFrame(base, None))
         for name, splats in clouds[first + 1 : first + 1 + count]:
-            found.append(StoredFrame(patch(base, compressed_ply(splats, name, order)), first))
-    return found
+            stored.append(StoredFrame(patch(base, compressed_ply(splats, name, order)), first))
+    return stored
 
 
 def _of_one_length(clouds: Sequence[tuple[str, Splats]]) -> list[tuple[str, Splats]]:

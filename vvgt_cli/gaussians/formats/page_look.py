@@ -1,4 +1,4 @@
-"""The look of a page, which can be changed where it holds the volume's values (docs/live.md)."""
+"""The look of a page, which can be changed where it holds the volume's values (docs/page.md)."""
 
 from __future__ import annotations
 
@@ -151,16 +151,16 @@ def parse_light(sent: Any, options: PlyOptions) -> Lighting | None:
         raise DataError(f"the page's light: expected finite numbers for from, {', '.join(numbers)}")
     if sent["kind"] == "none":
         return None
-    found = _axes(upright(options).up) @ np.array(toward, np.float64)
-    directions = () if sent["kind"] == "headlight" else (triple((found / np.linalg.norm(found)).tolist()),)
+    direction = _axes(upright(options).up) @ np.array(toward, np.float64)
+    directions = () if sent["kind"] == "headlight" else (triple((direction / np.linalg.norm(direction)).tolist()),)
     ambient, diffuse, specular, power = (float(sent[name]) for name in numbers)
     return Lighting(sent["kind"] == "headlight", directions, ambient, diffuse, specular, power)
 
 
 def _axes(up: str) -> np.ndarray:
     """Return the axes of the unit frame in the viewer's frame, as rows."""
-    found: np.ndarray = (_HALF_TURN @ up_matrix(up)).T
-    return found
+    axes: np.ndarray = (_HALF_TURN @ up_matrix(up)).T
+    return axes
 
 
 def nodes_of(facts: LiveFacts) -> list[dict[str, Any]]:

@@ -17,8 +17,7 @@ import numpy as np
 
 from vvgt_cli.gaussians.live import OPAQUE
 from vvgt_cli.gaussians.live_facts import LiveFacts
-from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
-from vvgt_cli.look.lighting import MATTE, Lighting
+from vvgt_cli.look import MATTE, ColorMap, Lighting, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.readers.names import named_function, names, titles
 from vvgt_cli.look.resolve import look_like_hounsfield, resolve
 from vvgt_cli.look.suggest import fitting
@@ -58,7 +57,7 @@ def presets_of(facts: LiveFacts, distance: float, edge: float, kind: str, name: 
     Returns:
         of each ``name``, ``title``, ``shows``, ``nodes`` and ``light``: its coefficients, None for none.
     """
-    named, found, known = names(), [], facts.statistics()
+    named, presets, known = names(), [], facts.statistics()
     hounsfield = kind == "ct"
     kind = kind or (name.split("-")[0] if name in named else "")
     for name in [name for name in named if kind and name.split("-")[0] == kind]:
@@ -67,8 +66,8 @@ def presets_of(facts: LiveFacts, distance: float, edge: float, kind: str, name: 
             continue
         tf = _per(resolve(tf, known, hounsfield=True), distance, edge)
         if tf.support(facts.lo, facts.hi) and not _is_own(tf, facts):
-            found.append(_entry(name, tf))
-    return _by_shares(facts)[: 0 if hounsfield else 1 if found else None] + found
+            presets.append(_entry(name, tf))
+    return _by_shares(facts)[: 0 if hounsfield else 1 if presets else None] + presets
 
 
 def told(name: str, facts: LiveFacts, distance: float, edge: float) -> dict[str, Any]:
@@ -146,8 +145,8 @@ def _per_longer(nodes: PiecewiseOpacity, times: float) -> PiecewiseOpacity:
     while True:
         y_between = (y[1:] + y[:-1]) / 2
         longer, between = (-np.expm1(times * np.log1p(-part)) for part in (y, y_between))
-        found, wanted = extinction((longer[1:] + longer[:-1]) / 2, 1.0), extinction(between, 1.0)
-        far = np.flatnonzero((np.abs(found - wanted) > 0.004 * wanted) & (x[1:] > x[:-1]))  # twice that beside 0
+        interpolated, wanted = extinction((longer[1:] + longer[:-1]) / 2, 1.0), extinction(between, 1.0)
+        far = np.flatnonzero((np.abs(interpolated - wanted) > 0.004 * wanted) & (x[1:] > x[:-1]))  # twice that beside 0
         if not far.size:
             return PiecewiseOpacity(x, longer)
         x, y = np.insert(x, far + 1, (x[far] + x[far + 1]) / 2), np.insert(y, far + 1, y_between[far])
@@ -239,10 +238,10 @@ class Sketch:
             for k, width in enumerate(step[::-1])
         ]
         grid = np.stack([values, *slopes[::-1], ~known], axis=-1).astype(np.float32)
-        found = _between(grid, at[inside].clip(0, dims - 1))
-        self.values, self.unknown = found[:, 0], found[:, 4] > 0
-        steep = np.linalg.norm(found[:, 1:4], axis=1)
-        self.facing = np.where(steep > 0, np.abs(found[:, 1:4] @ eye) / np.maximum(steep, 1e-30), 1)
+        samples = _between(grid, at[inside].clip(0, dims - 1))
+        self.values, self.unknown = samples[:, 0], samples[:, 4] > 0
+        steep = np.linalg.norm(samples[:, 1:4], axis=1)
+        self.facing = np.where(steep > 0, np.abs(samples[:, 1:4] @ eye) / np.maximum(steep, 1e-30), 1)
 
     def picture(self, tf: TransferFunction, distance: float, edge: float, light: Mapping[str, float] | None) -> str:
         """Return an address that is a picture itself, over black.
@@ -278,20 +277,20 @@ def _between(grid: np.ndarray, at: np.ndarray) -> np.ndarray:
     top, strides = np.array(grid.shape[2::-1]) - 1, np.array([1, grid.shape[2], grid.shape[2] * grid.shape[1]])
     ends = [np.minimum(low + end, top) * strides for end in (0, 1)]
     share, flat = (at - low).astype(np.float32), grid.reshape(-1, grid.shape[3])
-    found = np.zeros((len(at), grid.shape[3]), np.float32)
+    values = np.zeros((len(at), grid.shape[3]), np.float32)
     for corner in product((0, 1), repeat=3):
         i, j, k = (ends[end][:, axis] for axis, end in enumerate(corner))
         u, v, w = (share[:, axis] if end else 1 - share[:, axis] for axis, end in enumerate(corner))
-        found += (u * v * w)[:, None] * flat.take(i + j + k, axis=0)
-    return found
+        values += (u * v * w)[:, None] * flat.take(i + j + k, axis=0)
+    return values
 
 
 def _eye(space: str | None) -> np.ndarray:
     """Return the direction to the eye (3,) in the world: before, left and above of a body, or as orbits begin."""
     if space is None:
-        found = np.array([1.0, 0, 0.36])
+        eye = np.array([1.0, 0, 0.36])
     else:
         left, front, above = (1 if letter == positive else -1 for letter, positive in zip(space, "LAS", strict=True))
-        found = np.array([0.6 * left, 1.0 * front, 0.3 * above])
-    found /= np.linalg.norm(found)
-    return found
+        eye = np.array([0.6 * left, 1.0 * front, 0.3 * above])
+    eye /= np.linalg.norm(eye)
+    return eye

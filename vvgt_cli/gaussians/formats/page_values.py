@@ -20,14 +20,11 @@ import numpy as np
 from vvgt_cli.errors import NoLiveForm
 from vvgt_cli.gaussians.formats.page_presets import offers
 from vvgt_cli.gaussians.live_facts import LiveFacts
-from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.look.labels import LabelTable
-from vvgt_cli.look.lighting import Lighting
+from vvgt_cli.look import LabelTable, Lighting, TransferFunction
 from vvgt_cli.look.recognise import in_hounsfield
 from vvgt_cli.look.resolve import unit_of_values
+from vvgt_cli.volume import BINS, Statistics, Volume, edges_of
 from vvgt_cli.volume.averaged import averaged, coarser, sampled
-from vvgt_cli.volume.stats import BINS, Statistics, edges_of
-from vvgt_cli.volume.types import Volume
 
 ELEMENT = "values"  # prefix of the ids of elements, followed by the number of the layer
 MAX_CELLS = 1 << 24  # cells of all grids of a page: up to as many, all voxels
@@ -116,14 +113,14 @@ def values_of(layers: Sequence[Layer | None], room: float | None = None, share: 
         None if no layer has a grid, or there is no room for `FEWEST` cells.
     """
     most = MAX_CELLS if share == 1 else max(MAX_CELLS // share, FEWEST)
-    found = _grids(layers, most)
-    while found is not None and room is not None and found.size > room:
+    grids = _grids(layers, most)
+    while grids is not None and room is not None and grids.size > room:
         if most <= FEWEST:
             return None
-        cells = sum(math.prod(one["dims"]) for one in found.facts)
-        most = max(int(cells * min(CLOSER * max(room, 0) / found.size, CLOSER)), FEWEST)
-        found = _grids(layers, most, limited=True)
-    return found
+        cells = sum(math.prod(one["dims"]) for one in grids.facts)
+        most = max(int(cells * min(CLOSER * max(room, 0) / grids.size, CLOSER)), FEWEST)
+        grids = _grids(layers, most, limited=True)
+    return grids
 
 
 def _grids(layers: Sequence[Layer | None], most: int, limited: bool = False) -> Values | None:
@@ -189,9 +186,9 @@ def _labels(
     """Return facts and codes (nz, ny, nx) of labels, as many as fit."""
     labels = table.structures[: CODES - 1]
     numbers = np.array([one.number for one in labels], np.float64)
-    found = sampled(volume, dims)
-    row = np.searchsorted(numbers, found).clip(max=len(numbers) - 1)
-    codes = np.where(numbers[row] == found, row + 1, 0).astype(np.uint8 if len(labels) < 256 else np.uint16)
+    values = sampled(volume, dims)
+    row = np.searchsorted(numbers, values).clip(max=len(numbers) - 1)
+    codes = np.where(numbers[row] == values, row + 1, 0).astype(np.uint8 if len(labels) < 256 else np.uint16)
     return {"labels": [label.page_entry() for label in labels]}, codes
 
 

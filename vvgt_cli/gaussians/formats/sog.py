@@ -41,11 +41,16 @@ _SPARE = 4096  # pixels that an image may have beyond four per Gaussian
 _LARGEST_LOG = 80.0  # of a coordinate; float32 overflows at 88
 
 
+def edges(count: int) -> tuple[int, int]:
+    """Return width and height, multiples of 4 px, of images that hold ``count`` > 0 pixels."""
+    width = 4 * math.ceil(math.sqrt(count) / 4)
+    return width, 4 * math.ceil(count / width / 4)
+
+
 def images_of(splats: Splats) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Encode columns as images by name, (h, w, 4) uint8, and the content of `meta.json`, keeping their order."""
     count = len(splats)
-    width = 4 * math.ceil(math.sqrt(count) / 4)
-    height = 4 * math.ceil(count / width / 4)
+    width, height = edges(count)
 
     def image(columns: np.ndarray, alpha: np.ndarray | int = _BYTE) -> np.ndarray:
         pixels = np.zeros((height * width, 4), np.uint8)

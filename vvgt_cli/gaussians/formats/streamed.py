@@ -46,9 +46,9 @@ def level_files(path: str | Path) -> list[Path]:
         names = read_manifest(path)["filenames"] if is_streamed(path) else []
     except DataError:
         return []
-    found = [Path(path).parent / name for name in names]
-    found = [file for meta in found for file in (meta, *(meta.with_name(f"{image}.webp") for image in IMAGES))]
-    return [file for file in found if file.is_file()]
+    files = [Path(path).parent / name for name in names]
+    files = [file for meta in files for file in (meta, *(meta.with_name(f"{image}.webp") for image in IMAGES))]
+    return [file for file in files if file.is_file()]
 
 
 def remove_files(files: Iterable[Path]) -> None:
@@ -65,20 +65,20 @@ def read_manifest(path: str | Path) -> dict[str, Any]:
     try:
         if path.stat().st_size > _LARGEST:
             raise DataError(f"{path}: more than {_LARGEST >> 20} MiB; expected a manifest of streamed SOG")
-        found = json.loads(path.read_bytes())
+        manifest = json.loads(path.read_bytes())
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror}); expected a manifest of streamed SOG") from None
     except (ValueError, RecursionError) as error:
         raise DataError(f"{path}: not JSON ({' '.join(str(error).split())[:200]}); expected streamed SOG") from None
-    levels = found.get("lodLevels") if isinstance(found, dict) else None
-    files = found.get("filenames") if isinstance(found, dict) else None
+    levels = manifest.get("lodLevels") if isinstance(manifest, dict) else None
+    files = manifest.get("filenames") if isinstance(manifest, dict) else None
     if type(levels) is not int or not 0 < levels <= _MOST_LEVELS or not isinstance(files, list):
         raise DataError(f"{path}: no lodLevels from 1 to {_MOST_LEVELS} or no filenames; expected streamed SOG")
     for name in files:
         parts = name.split("/") if isinstance(name, str) else []
         if not parts or parts[-1] != META or any(part in ("", ".", "..") or "\\" in part for part in parts):
             raise DataError(f"{path}: names {name!r:.80}; expected files FOLDER/{META} next to it")
-    for node in nodes_of(found, path):
+    for node in nodes_of(manifest, path):
         for level, place in node["lods"].items():
             numbers = [place.get(key) if isinstance(place, dict) else None for key in ("file", "offset", "count")]
             whole = [number for number in numbers if type(number) is int and number >= 0]
@@ -87,22 +87,22 @@ def read_manifest(path: str | Path) -> dict[str, Any]:
                     f"{path}: a node has {place!r:.80} in level {level!r:.20}; expected file, offset and count of "
                     f"{levels} levels and {len(files)} files"
                 )
-    assert isinstance(found, dict)
-    return found
+    assert isinstance(manifest, dict)
+    return manifest
 
 
 def nodes_of(manifest: dict[str, Any], path: str | Path) -> list[dict[str, Any]]:
     """Return the nodes that have levels, in the order of the tree; raise DataError if it is not valid."""
-    found, waiting = [], [manifest.get("tree")]
+    nodes, waiting = [], [manifest.get("tree")]
     while waiting:
         node = waiting.pop()
         if isinstance(node, dict) and isinstance(node.get("lods"), dict):
-            found.append(node)
+            nodes.append(node)
         elif isinstance(node, dict) and isinstance(node.get("children"), list):
             waiting += reversed(node["children"])
         else:
             raise DataError(f"{path}: its tree has {node!r:.80}; expected nodes with children or lods")
-    return found
+    return nodes
 
 
 def facts_of(path: str | Path) -> dict[str, Any]:
@@ -149,6 +149,6 @@ def corners(manifest: dict[str, Any]) -> np.ndarray:
     with suppress(KeyError, TypeError, ValueError):
         boxes = [[node["bound"]["min"], node["bound"]["max"]] for node in nodes_of(manifest, MANIFEST)]
         ends = np.array(boxes, np.float64).reshape(-1, 2, 3)
-        found: np.ndarray = np.concatenate([ends[:, list(end), range(3)] for end in product((0, 1), repeat=3)])
-        return found if np.isfinite(found).all() else found[:0]
+        places: np.ndarray = np.concatenate([ends[:, list(end), range(3)] for end in product((0, 1), repeat=3)])
+        return places if np.isfinite(places).all() else places[:0]
     return np.empty((0, 3))

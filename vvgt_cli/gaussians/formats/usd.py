@@ -19,6 +19,7 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians.formats.nodes import ROOT, Node, common_comments, group_names, offset_in, placed, report_off
 from vvgt_cli.gaussians.formats.splats import DEGREES, Splats, joined, log_scales_of, logits_of, opacities_of
+from vvgt_cli.gaussians.header import facts_in
 from vvgt_cli.volume.libraries import library_errors, need
 
 KIND = "ParticleField3DGaussianSplat"
@@ -71,7 +72,7 @@ def usdc(nodes: Sequence[Node], name: str) -> bytes:
                 centre, splats = node.centred()
                 move = UsdGeom.Xformable(prim).AddTranslateOp(UsdGeom.XformOp.PrecisionDouble)
                 move.Set(Gf.Vec3d(*centre.tolist()))
-            _put(prim, splats, name)
+            _put(prim, splats, comments, name)
             if node.facts:
                 prim.SetCustomData({key: _custom(value) for key, value in node.facts.items()})
             if not node.visible:
@@ -117,9 +118,9 @@ def _custom(value: Any) -> Any:
     return value
 
 
-def _put(prim: Any, splats: Splats, name: str) -> None:
-    """Set the attributes of a prim of Gaussians."""
-    from pxr import Vt
+def _put(prim: Any, splats: Splats, comments: tuple[str, ...], name: str) -> None:
+    """Set the attributes of a prim of Gaussians, sorted and projected as by the rule that ``comments`` record."""
+    from pxr import Gf, Usd, Vt
 
     scales = np.exp(splats.log_scales.astype(np.float64)).astype(np.float32)
     harmonics = np.concatenate([splats.f_dc[:, None], splats.f_rest], axis=1)
@@ -133,7 +134,10 @@ def _put(prim: Any, splats: Splats, name: str) -> None:
         "radiance:sphericalHarmonicsDegree": DEGREES[splats.f_rest.shape[1]],
         "radiance:sphericalHarmonicsCoefficients": Vt.Vec3fArray.FromNumpy(_plain(harmonics.reshape(-1, 3))),
         "extent": Vt.Vec3fArray.FromNumpy(_plain(corners)),
+        "sortingModeHint": "cameraDistance" if facts_in(list(comments), name).get("rule") == "spark" else "zDepth",
+        "projectionModeHint": "perspective",
     }
+    Usd.ColorSpaceAPI.Apply(prim).CreateColorSpaceNameAttr(Gf.ColorSpaceNames.SRGBRec709)  # blended as stored
     for attribute, value in values.items():
         if not prim.GetAttribute(attribute).Set(value):
             raise DataError(f"{name}: OpenUSD does not accept {attribute} of a {KIND}")

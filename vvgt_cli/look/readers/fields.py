@@ -138,8 +138,8 @@ def attribute(what: str, attributes: dict[str, str], key: str) -> float:
 def table(what: str, value: Any, width: int, columns: str) -> np.ndarray:
     """Return a flat list of finite numbers as rows of ``width``, (n, width) float64, n >= 1, or raise DataError."""
     if not isinstance(value, list) or not value or len(value) % width:
-        found = f"a list of {len(value)}" if isinstance(value, list) else _shown(value)
-        raise DataError(f"{what}: {found}; expected a flat list of {columns}, {width} numbers a node")
+        given = f"a list of {len(value)}" if isinstance(value, list) else _shown(value)
+        raise DataError(f"{what}: {given}; expected a flat list of {columns}, {width} numbers a node")
     return np.array([number(f"{what}[{i}]", v) for i, v in enumerate(value)]).reshape(-1, width)
 
 

@@ -51,11 +51,11 @@ def _clut(text: str, path: Path) -> dict[str, Any]:
     ini = configparser.ConfigParser(strict=False, interpolation=None)
     try:
         ini.read_string(text)
-        found = {key: value for section in ini.values() for key, value in section.items()}
-        nodes = [map(float, found[f"nodergba{k}"].split("|")) for k in range(int(found["numnodes"]))]
-        places = [float(found[f"nodeintensity{k}"]) for k in range(len(nodes))]
+        entries = {key: value for section in ini.values() for key, value in section.items()}
+        nodes = [map(float, entries[f"nodergba{k}"].split("|")) for k in range(int(entries["numnodes"]))]
+        places = [float(entries[f"nodeintensity{k}"]) for k in range(len(nodes))]
         columns = dict(zip("RGBA", map(list, zip(*nodes, strict=True)), strict=True))
-        return columns | {"I": places} | {key: float(found.get(key, 0)) for key in ("min", "max")}
+        return columns | {"I": places} | {key: float(entries.get(key, 0)) for key in ("min", "max")}
     except (configparser.Error, KeyError, ValueError) as error:
         reason = " ".join(str(error).split())[:80]
         raise DataError(f"{path}: {reason}; expected numnodes, nodeintensity0=0, nodergba0=R|G|B|A, ...") from None

@@ -142,7 +142,7 @@ def _points(value: Any, what: str) -> tuple[list[tuple[float, float]], list[tupl
             opacities.append((x, number(f"{here}.opacity", point["opacity"])))
         if "rgb" in point:
             colors.append((x, rgb(f"{here}.rgb", point["rgb"])))
-    for missing, found in (("opacity", opacities), ("rgb", colors)):
-        if not found:
+    for missing, rows in (("opacity", opacities), ("rgb", colors)):
+        if not rows:
             raise DataError(f"{what}: no point has {missing}; expected at least one")
     return opacities, colors

@@ -41,14 +41,14 @@ class TrainingProgress:
         skipped: steps without an update because something was not finite.
         best: largest mean gain on held-out scenes so far, dB.
         seconds: of training, over all resumptions.
-        found: latest scores of the held-out scenes.
+        scores: latest scores of the held-out scenes.
     """
 
     step: int = 0
     skipped: int = 0
     best: float = -math.inf
     seconds: float = 0.0
-    found: dict[str, float] = field(default_factory=dict)
+    scores: dict[str, float] = field(default_factory=dict)
 
 
 def train(config: TrainConfig, data: str, output: str, console: Console, ended: Sequence[int] = ()) -> int:
@@ -183,14 +183,14 @@ class _Run:
         gains = []
         for part in parts:
             mine = self.scenes[part][self.here.rank :: self.here.size]
-            found = np.array([score_scene(self.network, scene, self.config, self.here.device) for scene in mine])
+            scores = np.array([score_scene(self.network, scene, self.config, self.here.device) for scene in mine])
             rounds = self.config.network.rounds
-            sums = found.sum(axis=0) if len(found) else np.zeros(rounds + 1)
+            sums = scores.sum(axis=0) if len(scores) else np.zeros(rounds + 1)
             means = np.array(self.here.total(sums)) / len(self.scenes[part])
             row[f"{part}: psnr before"] = float(means[0])
             row |= {f"{part}: gain {number}": float(means[number] - means[0]) for number in range(1, rounds + 1)}
             gains.append(row[f"{part}: gain {rounds}"])
-        self.progress.found = {key: value for key, value in row.items() if key != "step"}
+        self.progress.scores = {key: value for key, value in row.items() if key != "step"}
         if float(np.mean(gains)) > self.progress.best:
             self.progress.best = float(np.mean(gains))
             self._write(BEST, {})
@@ -211,7 +211,7 @@ class _Run:
             "step": state.step, "skipped": state.skipped, "seconds": round(state.seconds, 1),
             "processes": self.here.size, "device": self.here.device.type, "torch": str(torch.__version__),
         }  # fmt: skip
-        checkpoint = NetworkCheckpoint(self.network, lists(training), lists(state.found), self.commit)
+        checkpoint = NetworkCheckpoint(self.network, lists(training), lists(state.scores), self.commit)
         with atomic_write(self.folder / name, overwrite=True) as temporary:
             save_checkpoint(temporary, checkpoint, more)
 
@@ -230,10 +230,10 @@ def commit() -> str:
     """Return the commit of the checkout that this runs from; "unknown" outside of one."""
     here = Path(__file__).parent
     try:
-        found = subprocess.run(["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, timeout=10)
+        git = subprocess.run(["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, timeout=10)
     except (OSError, subprocess.SubprocessError):
         return "unknown"
-    return found.stdout.strip() or "unknown"
+    return git.stdout.strip() or "unknown"
 
 
 @dataclass(frozen=True)
@@ -359,8 +359,8 @@ class Recorder:
         """Record the scores of the held-out scenes."""
         self.held.add(row)
         self._plot("held", row)
-        found = ", ".join(f"{key} {value:+.3f} dB" for key, value in row.items() if "gain" in key)
-        self.console.message(f"step {row['step']}, held out: {found}")
+        gains = ", ".join(f"{key} {value:+.3f} dB" for key, value in row.items() if "gain" in key)
+        self.console.message(f"step {row['step']}, held out: {gains}")
 
     def _plot(self, group: str, row: dict[str, Any]) -> None:
         if self.board is not None:

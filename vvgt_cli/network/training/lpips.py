@@ -35,13 +35,13 @@ class Lpips(nn.Module):
         """Return the last features (1, c, h', w') before each pooling and at the end, of (h, w, 3) in [0, 1]."""
         shift, scale = picture.new_tensor(SHIFT), picture.new_tensor(SCALE)
         x = ((2 * picture - 1 - shift) / scale).permute(2, 0, 1)[None]
-        layers, found = iter(self.convolutions), []
+        layers, features = iter(self.convolutions), []
         for number, stage in enumerate(STAGES):
             x = functional.max_pool2d(x, 2) if number else x
             for _ in stage:
                 x = functional.relu(next(layers)(x))
-            found.append(x)
-        return found
+            features.append(x)
+        return features
 
     def forward(self, a: Tensor, b: Tensor) -> Tensor:
         """Return the distance of pictures (h, w, 3), at least 16 pixels a side."""
@@ -66,10 +66,10 @@ def load_lpips(config: LossConfig) -> Lpips | None:
     """
     if not config.lpips:
         return None
-    found = Lpips()
+    network = Lpips()
     state = _backbone(config.lpips_backbone) | _linear(config.lpips_linear)
-    load_weights(found, state, f"{config.lpips_backbone}, {config.lpips_linear}")
-    result: Lpips = found.eval()
+    load_weights(network, state, f"{config.lpips_backbone}, {config.lpips_linear}")
+    result: Lpips = network.eval()
     return result
 
 

@@ -15,8 +15,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from vvgt_cli.cameras import Camera, farthest_cameras
-from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.constants import DILATION, MAX_ALPHA, NEAR, TILE
+from vvgt_cli.gaussians import DILATION, MAX_ALPHA, NEAR, TILE, Gaussians
 from vvgt_cli.images import metrics
 from vvgt_cli.images.metrics import C1, C2, RADIUS, SIGMA
 from vvgt_cli.network.checkpoint import tensors_of
@@ -113,15 +112,15 @@ def accumulate_gradients(
 def score_scene(network: Vvgt, scene: TrainingScene, config: TrainConfig, device: torch.device) -> list[float]:
     """Return the PSNR on all targets of the initial Gaussians, and after every round."""
     few, gaussians = farthest_cameras(scene.cameras, config.network.total_views), scene.gaussians
-    found = [mean_psnr(gaussians, scene.targets, scene.target_images)]
+    scores = [mean_psnr(gaussians, scene.targets, scene.target_images)]
     for number in range(config.network.rounds):
         shown = views_of_round(few, number, config.network.rounds)
         cameras, images = [scene.cameras[i] for i in shown], as_float(scene.images[shown])
         prepared = prepare(gaussians, cameras, images, config.network)
         rows = run_network(network, tensors_of(prepared.arrays()), device).cpu().numpy()
         gaussians = prepared.accept(rows, cameras, images)
-        found.append(mean_psnr(gaussians, scene.targets, scene.target_images))
-    return found
+        scores.append(mean_psnr(gaussians, scene.targets, scene.target_images))
+    return scores
 
 
 def mean_psnr(gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarray) -> float:

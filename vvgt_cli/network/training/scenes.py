@@ -17,8 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera, default_views
-from vvgt_cli.cameras.sets import fibonacci_views
+from vvgt_cli.cameras import Camera, default_views, fibonacci_views
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.look.suggest import Suggestion
@@ -104,10 +103,10 @@ def recipes(folder: Path, config: SceneConfig) -> dict[str, list[Recipe]]:
 def _volumes(folder: Path) -> list[str]:
     if not folder.is_dir():
         raise UsageError(f"--data {folder.parent}: no folder {folder.name}/; expected volumes in train/ and in held/")
-    found = sorted(str(path) for path in folder.iterdir() if path.is_file())
-    if not found:
+    files = sorted(str(path) for path in folder.iterdir() if path.is_file())
+    if not files:
         raise UsageError(f"--data {folder.parent}: {folder.name}/ is empty; expected volumes ('vvgt synth' makes some)")
-    return found
+    return files
 
 
 def _subset(entries: Sequence[str], count: int) -> list[str]:

@@ -89,7 +89,7 @@ def _numbered(axes: Sequence[Axis], beside: Mapping[str, Neighbour]) -> list[Axi
     """Return axes with coordinates whose names count the axes from 0 or 1; None unless all are there and ascend."""
     matches = {int(m[1]): one for name, one in beside.items() if (m := _NUMBERED.fullmatch(name))}
     first = min(matches, default=0)
-    found = []
+    placed = []
     for k, old in enumerate(axes):
         one = matches.get(k + first)
         if one is None or first > 1 or one.size not in (2, old.size):
@@ -97,20 +97,20 @@ def _numbered(axes: Sequence[Axis], beside: Mapping[str, Neighbour]) -> list[Axi
         values, attributes = one.read()
         unit = text_of(attributes.get("units", "")).strip("[]").replace("_", "")  # EMD: [n_m]
         line = values if one.size == old.size else values[0] + np.arange(old.size) * (values[1] - values[0])
-        found.append(axis(text_of(attributes.get("name", "")), old.size, line, {"units": unit}))
-    return found if all(a.size == 1 or _ascends(a) for a in found) else None
+        placed.append(axis(text_of(attributes.get("name", "")), old.size, line, {"units": unit}))
+    return placed if all(a.size == 1 or _ascends(a) for a in placed) else None
 
 
 def _read(name: str, one: Neighbour) -> Axis:
     """Read a neighbour as an axis, with the role and the unit that its attributes or its name state."""
     values, attributes = one.read()
     leaf, centres = name.rpartition("/")[2], np.ravel(values) if values.dtype.kind in "iuf" else None
-    found = axis(leaf, one.size, centres, attributes)
-    letter = None if found.role else _LETTER.fullmatch(leaf)
+    line = axis(leaf, one.size, centres, attributes)
+    letter = None if line.role else _LETTER.fullmatch(leaf)
     if letter and (_SUFFIXES.fullmatch(letter[2]) or metres(letter[2])):
         stated = {"axis": letter[1], "units": letter[2] if metres(letter[2]) else ""}
         return axis(leaf, one.size, centres, stated | dict(attributes))
-    return found
+    return line
 
 
 def _lies_along(one: Neighbour, a: Axis, read: Axis | None = None) -> bool:

@@ -33,24 +33,24 @@ def conventional_axes(file: Any, dataset: Any, source: str) -> tuple[list[Axis],
     group, sizes = dataset.parent, dataset.attrs.get("element_size_um", ())  # z, y, x
     if "openPMD" in file.attrs and ("axisLabels" in dataset.attrs or "axisLabels" in group.attrs):
         return _openpmd(dataset, source)
-    found: list[Axis] = []
+    axes: list[Axis] = []
     more: dict[str, Any] = {}
     if text_of(group.attrs.get("NX_class", "")) == "NXdata" and "axes" in group.attrs:
-        found, more = _nexus(group, dataset), _nexus_scaling(group, dataset.name.rpartition("/")[2])
+        axes, more = _nexus(group, dataset), _nexus_scaling(group, dataset.name.rpartition("/")[2])
     elif "_SIMPL_GEOMETRY/SPACING" in group.parent and len(dataset.shape) >= 3:
-        found = _dream3d(group.parent["_SIMPL_GEOMETRY"], dataset)
+        axes = _dream3d(group.parent["_SIMPL_GEOMETRY"], dataset)
     elif view := re.fullmatch(r"/t\d+/(s\d+)/(\d+)/cells", dataset.name):
         return _bigdataviewer(file[view[1]], int(view[2]), dataset)
     elif re.fullmatch("/Data/Image/[^/]+/Data", dataset.name) and len(dataset.shape) == 3:
-        found = _velox(group, dataset)
+        axes = _velox(group, dataset)
     elif "axistags" in dataset.attrs:
-        found = _vigra(json.loads(text_of(dataset.attrs["axistags"])).get("axes", []), dataset)
+        axes = _vigra(json.loads(text_of(dataset.attrs["axistags"])).get("axes", []), dataset)
     elif np.size(sizes) == 3 and len(dataset.shape) >= 3:
         *outer, nz, ny, nx = dataset.shape
-        found = [Axis("", n) for n in outer]
+        axes = [Axis("", n) for n in outer]
         for name, n, step in zip("zyx", (nz, ny, nx), np.ravel(sizes).astype(np.float64), strict=True):
-            found.append(Axis(name, n, step * np.arange(n), "um", name))
-    return (found, more) if found else None
+            axes.append(Axis(name, n, step * np.arange(n), "um", name))
+    return (axes, more) if axes else None
 
 
 def _openpmd(dataset: Any, source: str) -> tuple[list[Axis], dict[str, Any]]:
@@ -68,10 +68,10 @@ def _openpmd(dataset: Any, source: str) -> tuple[list[Axis], dict[str, Any]]:
         )
     labels = [text_of(label) for label in np.asarray(mesh["axisLabels"]).reshape(-1)]
     stated = [(mesh, "gridSpacing", 1.0), (mesh, "gridGlobalOffset", 0.0), (dataset.attrs, "position", 0.0)]
-    found = [np.ravel(where.get(key, default)) for where, key, default in (*stated, (mesh, "gridUnitSI", 1.0))]
-    if len(labels) != n or not {one.size for one in found} <= {1, n}:
+    numbers = [np.ravel(where.get(key, default)) for where, key, default in (*stated, (mesh, "gridUnitSI", 1.0))]
+    if len(labels) != n or not {one.size for one in numbers} <= {1, n}:
         raise DataError(f"{source}: openPMD axes {', '.join(labels)} for {n} axes of values; expected as many")
-    spacing, offset, position, unit = (np.broadcast_to(one.astype(np.float64), n) for one in found)
+    spacing, offset, position, unit = (np.broadcast_to(one.astype(np.float64), n) for one in numbers)
     order = slice(None, None, -1 if text_of(mesh.get("dataOrder", "C")) == "F" else 1)
     step, start = (spacing * unit)[order], ((offset + position * spacing) * unit)[order]
     axes = [

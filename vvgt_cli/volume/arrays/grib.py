@@ -23,23 +23,23 @@ _UNITS = {"isobaricInhPa": "hPa", "isobaricInPa": "Pa", "hybrid": "level"}
 def grib_volume(path: Path, options: ReadOptions) -> Volume:
     """Read one variable at one time; levels are z, upwards, members of an ensemble are variables of their own."""
     codes, source = need("eccodes", "grib", str(path), "GRIB"), str(path)
-    found: dict[str, dict[tuple[Any, ...], dict[float, int]]] = {}  # variable, time, level, byte
+    fields: dict[str, dict[tuple[Any, ...], dict[float, int]]] = {}  # variable, time, level, byte
     with library_errors(source, "GRIB"), open(path, "rb") as file:
         while (message := codes.codes_grib_new_from_file(file, headers_only=True)) is not None:
             names = [str(codes.codes_get(message, key)) for key in ("shortName", "typeOfLevel")]
             names += [str(codes.codes_get(message, "number"))] if codes.codes_is_defined(message, "number") else []
             when = tuple(codes.codes_get(message, key) for key in _TIME)
-            levels = found.setdefault("/".join(names), {}).setdefault(when, {})
+            levels = fields.setdefault("/".join(names), {}).setdefault(when, {})
             level = codes.codes_get(message, "level", float)
             if levels.setdefault(level, at := int(codes.codes_get(message, "offset"))) != at:
                 raise DataError(f"{source}: two messages of {'/'.join(names)} have level {level:g} at one time")
             codes.codes_release(message)
-        infos = [ArrayInfo(name, "point", 1, "float32") for name in found]
+        infos = [ArrayInfo(name, "point", 1, "float32") for name in fields]
         name = infos[choose_array(infos, options.array, source)].name
-        whens = sorted(found[name])
+        whens = sorted(fields[name])
         dates = [datetime.strptime(f"{when[0]:08d}{when[1]:04d}", "%Y%m%d%H%M") for when in whens]
         hours = [(date - dates[0]).total_seconds() / 3600 for date in dates]
-        levels = found[name][whens[options.step(len(whens), source, times=hours)]]
+        levels = fields[name][whens[options.step(len(whens), source, times=hours)]]
         down = not name.split("/")[1].startswith(("height", "theta", "potential"))
         planes, axes = [], [Axis("", 0)]
         for level in sorted(levels):

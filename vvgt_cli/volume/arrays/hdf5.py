@@ -85,10 +85,10 @@ def checked_dataset(h5py: Any, file: Any, path: Path, name: str) -> Any:
 def _choose(h5py: Any, file: Any, wanted: str | None, path: Path) -> Any:
     if wanted is not None:
         _check_links(h5py, file, wanted, path)
-        found = file.get(wanted)
-        if isinstance(found, h5py.Dataset):
-            return file[choose_grid({found.name: (found.shape or (), found.dtype.name)}, found.name, str(path))]
-        file, wanted = (found, None) if isinstance(found, h5py.Group) else (file, wanted)
+        item = file.get(wanted)
+        if isinstance(item, h5py.Dataset):
+            return file[choose_grid({item.name: (item.shape or (), item.dtype.name)}, item.name, str(path))]
+        file, wanted = (item, None) if isinstance(item, h5py.Group) else (file, wanted)
     known = {d.name: (d.shape, d.dtype.name) for d in datasets(h5py, file)}
     how = f"choose one as {path}:{printable(next(iter(known), '/path'))} (or with --array)"
     return file[choose_grid(known, wanted, str(path), "dataset", how)]
@@ -96,7 +96,7 @@ def _choose(h5py: Any, file: Any, wanted: str | None, path: Path) -> Any:
 
 def datasets(h5py: Any, group: Any) -> list[Any]:
     """List the datasets of numbers with 1 to 5 axes, but for those that describe others, such as bounds of cells."""
-    found: list[Any] = []
+    listed: list[Any] = []
     described: set[str] = set()
     seen = 0
 
@@ -107,16 +107,16 @@ def datasets(h5py: Any, group: Any) -> list[Any]:
         numbers = isinstance(item, h5py.Dataset) and item.dtype.kind in "iufb"
         text = numbers and item.dtype == np.uint8 and name.endswith("Metadata")  # of Velox
         if numbers and not text and 1 <= len(item.shape or ()) <= 5:
-            found.append(item)
+            listed.append(item)
         return True if seen >= MAX_VISITED else None
 
     group.visititems(visit)
-    return [d for d in found if d.name.rpartition("/")[2] not in described] or found
+    return [d for d in listed if d.name.rpartition("/")[2] not in described] or listed
 
 
 def _beside(h5py: Any, dataset: Any, path: Path) -> dict[str, Neighbour]:
     """List the datasets in the group of another, and in groups of coordinates beside that or above."""
-    here, found = dataset.parent, {}
+    here, neighbours = dataset.parent, {}
 
     def read(item: Any) -> tuple[np.ndarray, dict[str, Any]]:
         check_storage(h5py, item, path, f"{path}:{printable(item.name)}")
@@ -127,11 +127,11 @@ def _beside(h5py: Any, dataset: Any, path: Path) -> dict[str, Neighbour]:
         coordinates = GROUPS.fullmatch(group.name.rpartition("/")[2]) and group.parent in (here, here.parent)
         near = isinstance(item, h5py.Dataset) and item != dataset and (group == here or coordinates)
         if near and not _is_bare(item):
-            found[item.name.removeprefix(here.name).strip("/")] = Neighbour.of(item.shape, partial(read, item))
-        return True if len(found) >= MAX_BESIDE else None
+            neighbours[item.name.removeprefix(here.name).strip("/")] = Neighbour.of(item.shape, partial(read, item))
+        return True if len(neighbours) >= MAX_BESIDE else None
 
     here.parent.visititems(visit)
-    return found
+    return neighbours
 
 
 def _check_links(h5py: Any, file: Any, wanted: str, path: Path) -> None:

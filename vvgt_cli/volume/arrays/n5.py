@@ -78,10 +78,10 @@ class N5Array:
         if mode not in (0, 1) or not sizes or not fits:
             raise DataError(f"{file}: a block of mode {mode} and {sizes} values; expected at most {self.blocks[::-1]}")
         need_bytes = math.prod(sizes) * self.dtype.itemsize
-        found = unpack(self.compression, packed[4 + 4 * axes + 4 * (mode == 1) :], need_bytes, str(file))
-        if len(found) != need_bytes:
-            raise DataError(f"{file}: {len(found)} bytes; its {sizes} values need {need_bytes}; fetch the block again")
-        return np.frombuffer(found, self.dtype).reshape(sizes[::-1])
+        raw = unpack(self.compression, packed[4 + 4 * axes + 4 * (mode == 1) :], need_bytes, str(file))
+        if len(raw) != need_bytes:
+            raise DataError(f"{file}: {len(raw)} bytes; its {sizes} values need {need_bytes}; fetch the block again")
+        return np.frombuffer(raw, self.dtype).reshape(sizes[::-1])
 
 
 def unpack(compression: dict[str, Any], data: bytes, size: int, source: str) -> bytes:
@@ -169,10 +169,10 @@ def _levels(group: Path) -> list[Path]:
     """List the folders ``s0``, ``s1``, ... of arrays in a group that is no array itself."""
     if "dimensions" in _metadata(group):
         return []
-    found: list[Path] = []
-    while "dimensions" in _metadata(group / f"s{len(found)}") and len(found) < 64:
-        found.append(group / f"s{len(found)}")
-    return found
+    levels: list[Path] = []
+    while "dimensions" in _metadata(group / f"s{len(levels)}") and len(levels) < 64:
+        levels.append(group / f"s{len(levels)}")
+    return levels
 
 
 def _choose(path: Path, options: ReadOptions) -> Path:
@@ -197,16 +197,16 @@ def _choose(path: Path, options: ReadOptions) -> Path:
 
 def _arrays(root: Path) -> list[Path]:
     """List the arrays and pyramids in a group and the groups below it."""
-    found: list[Path] = []
+    arrays: list[Path] = []
     groups, seen = [root], 0
     while groups and seen < MAX_VISITED:
         group, seen = groups.pop(0), seen + 1
         facts = _metadata(group)
         if _levels(group) or len(facts.get("dimensions", ())) >= 2:
-            found.append(group)
+            arrays.append(group)
         elif "dimensions" not in facts:
             groups += sorted(p for p in group.iterdir() if p.is_dir() and not p.is_symlink())
-    return found
+    return arrays
 
 
 def _array(place: Path) -> N5Array:

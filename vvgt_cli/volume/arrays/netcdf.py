@@ -102,34 +102,34 @@ def _part(path: Path, where: str, index: tuple[Any, ...]) -> np.ndarray:
 
 def _chunks(variable: Any) -> list[int]:
     """Return the values along each axis that the file packs together; a slice of plain values."""
-    found = variable.chunking()
-    if isinstance(found, list | tuple):
-        return [int(n) for n in found]
+    sizes = variable.chunking()
+    if isinstance(sizes, list | tuple):
+        return [int(n) for n in sizes]
     return [1] * (len(variable.shape) - 2) + list(variable.shape[-2:])
 
 
 def _choose(file: Any, wanted: str | None, path: Path) -> Any:
     """Return the variable asked for, else the only one of three axes or more (of two, if there is none)."""
-    found: dict[str, Any] = {}
+    variables: dict[str, Any] = {}
     groups = [("", file)]
     while groups:
         prefix, group = groups.pop(0)
-        found |= {prefix + name: variable for name, variable in group.variables.items()}
+        variables |= {prefix + name: variable for name, variable in group.variables.items()}
         groups += [(f"{prefix}{name}/", inner) for name, inner in group.groups.items()]
     described = {
         name
-        for variable in found.values()
+        for variable in variables.values()
         for name in described_by({key: variable.getncattr(key) for key in DESCRIBES if key in variable.ncattrs()})
     }
     fits = {
         name: variable
-        for name, variable in found.items()
+        for name, variable in variables.items()
         if isinstance(variable.dtype, np.dtype) and variable.dtype.kind in "iuf"
         and name.rpartition("/")[2] not in described
     }  # fmt: skip
     wanted = wanted and wanted.strip("/")
-    if wanted in found:
-        fits = {wanted: found[wanted]}
+    if wanted in variables:
+        fits = {wanted: variables[wanted]}
     rows = {name: f"{name} ({', '.join(v.dimensions)}: {' x '.join(map(str, v.shape))})" for name, v in fits.items()}
     grids = {name: (v.shape, np.dtype(v.dtype).name) for name, v in fits.items()}
     return fits[choose_grid(grids, wanted, str(path), "variable", rows=rows)]
@@ -212,27 +212,27 @@ class _Header:
 
     def items(self, tag: int) -> int:
         """Read how many things a list of ``tag`` has."""
-        found, n = self.number(4), self.count()
-        if found != tag and (found, n) != (0, 0):
-            raise self.bad(f"has the tag {found} where {tag} was expected")
+        there, n = self.number(4), self.count()
+        if there != tag and (there, n) != (0, 0):
+            raise self.bad(f"has the tag {there} where {tag} was expected")
         return n
 
     def kind(self) -> np.dtype:
         """Read the type of values."""
-        found = self.number(4)
-        if found not in _TYPES:
-            raise self.bad(f"has values of type {found}")
-        return np.dtype(_TYPES[found])
+        code = self.number(4)
+        if code not in _TYPES:
+            raise self.bad(f"has values of type {code}")
+        return np.dtype(_TYPES[code])
 
     def attributes(self) -> dict[str, Any]:
-        found: dict[str, Any] = {}
+        values: dict[str, Any] = {}
         for _ in range(self.items(_ATTRIBUTE)):
             name, kind, n, begin = self.name(), self.kind(), self.count(), self.at
             self.skip(kind.itemsize * n)
             data = self.data[begin : begin + kind.itemsize * n]
             text = kind.kind == "S"
-            found[_plain(name)] = _plain(data) if text else np.frombuffer(data, kind)
-        return found
+            values[_plain(name)] = _plain(data) if text else np.frombuffer(data, kind)
+        return values
 
 
 def _plain(data: bytes) -> str:
@@ -252,14 +252,14 @@ def check_header(path: Path) -> dict[str, Variable]:
         if any(n < 0 for n in lengths) or lengths.count(0) > 1:
             raise header.bad(f"has dimensions of sizes {lengths[:9]}")
         header.attributes()
-        found = {}
+        variables = {}
         for _ in range(header.items(_VARIABLE)):
             name = _plain(header.name())
-            found[name] = _variable(header, sizes, records)
-    rows = [v.dtype.itemsize * math.prod(v.shape[1:]) for v in found.values() if v.endless]
+            variables[name] = _variable(header, sizes, records)
+    rows = [v.dtype.itemsize * math.prod(v.shape[1:]) for v in variables.values() if v.endless]
     padded = sum(-(-n // 4) * 4 for n in rows)  # each to four bytes, where there are several
     step = padded if len(rows) > 1 else sum(rows)
-    return {name: replace(v, step=step) if v.endless else v for name, v in found.items()}
+    return {name: replace(v, step=step) if v.endless else v for name, v in variables.items()}
 
 
 def _variable(header: _Header, sizes: list[tuple[str, int]], records: int) -> Variable:

@@ -65,14 +65,14 @@ def _segments(labels: dict[str, Any]) -> list[Segment]:
     """Return the segments of OME-Zarr's ``image-label``: named by the first text of their properties."""
     colors = {int(one["label-value"]): [v / 255 for v in one["rgba"]] for one in labels.get("colors") or []}
     properties = {int(one["label-value"]): one for one in labels.get("properties") or []}
-    found = []
+    segments = []
     for number in colors.keys() | properties.keys():
         named = {key: text for key, text in properties.get(number, {}).items() if isinstance(text, str)}
         name = next((named[key] for key in ("name", "class", "label") if key in named), next(iter(named.values()), ""))
         red, green, blue, opacity = colors.get(number, (0.0, 0.0, 0.0, None))
         color = None if opacity is None else (red, green, blue)
-        found.append(Segment(number, name, color, opacity=opacity if number else 0.0))
-    return found
+        segments.append(Segment(number, name, color, opacity=opacity if number else 0.0))
+    return segments
 
 
 def _array(zarr: Any, place: Path) -> Any:
@@ -123,10 +123,10 @@ def json_object(file: Path) -> dict[str, Any]:
     """Read a file of metadata; raise DataError for more than `MAX_METADATA` bytes, or no JSON object."""
     if file.stat().st_size > MAX_METADATA:
         raise DataError(f"{file}: {file.stat().st_size} bytes; expected metadata of at most 16 MiB")
-    found = json.loads(file.read_text("utf-8"))
-    if not isinstance(found, dict):
+    content = json.loads(file.read_text("utf-8"))
+    if not isinstance(content, dict):
         raise DataError(f"{file}: expected a JSON object of metadata")
-    return found
+    return content
 
 
 def _metadata(folder: Path) -> dict[str, Any]:
@@ -134,10 +134,10 @@ def _metadata(folder: Path) -> dict[str, Any]:
     for name in _METADATA:
         file = folder / name
         if file.is_file():
-            found = json_object(file)
+            facts = json_object(file)
             if name == ".zarray":
-                return {"node_type": "array", **found}
-            return {"node_type": "group", **found} if name == ".zgroup" else found
+                return {"node_type": "array", **facts}
+            return {"node_type": "group", **facts} if name == ".zgroup" else facts
     return {}
 
 
@@ -180,16 +180,16 @@ def _type(facts: dict[str, Any]) -> str:
 
 def _arrays(root: Path) -> list[tuple[Path, dict[str, Any]]]:
     """List the arrays below a group."""
-    found: list[tuple[Path, dict[str, Any]]] = []
+    arrays: list[tuple[Path, dict[str, Any]]] = []
     groups = [root]
     while groups:
         for folder in sorted(p for p in groups.pop(0).iterdir() if p.is_dir() and not p.is_symlink()):
             facts = _metadata(folder)
             if facts.get("node_type") == "array" and facts.get("shape"):
-                found.append((folder, facts))
+                arrays.append((folder, facts))
             elif facts.get("node_type") == "group":
                 groups.append(folder)
-    return found
+    return arrays
 
 
 def _check_codecs(place: Path, facts: dict[str, Any]) -> None:
@@ -215,10 +215,10 @@ def _attributes(folder: Path) -> dict[str, Any]:
     """Read the attributes of a node of either version."""
     old = folder / ".zattrs"
     if old.is_file() and old.stat().st_size <= MAX_METADATA:
-        found = json.loads(old.read_text("utf-8"))
+        attributes = json.loads(old.read_text("utf-8"))
     else:
-        found = _metadata(folder).get("attributes")
-    return found if isinstance(found, dict) else {}
+        attributes = _metadata(folder).get("attributes")
+    return attributes if isinstance(attributes, dict) else {}
 
 
 def _beside(zarr: Any, path: Path, place: Path, names: Sequence[str]) -> dict[str, Neighbour]:
@@ -232,12 +232,12 @@ def _beside(zarr: Any, path: Path, place: Path, names: Sequence[str]) -> dict[st
     folders = [group / name for name in names if name and "/" not in name and name not in (".", "..")]
     with suppress(OSError, NotImplementedError):
         folders += [f for f in group.iterdir() if f.is_dir() and not f.is_symlink()] if place != path else []
-    found = {}
+    neighbours = {}
     for folder in folders:
         facts = _metadata(folder) if folder != place else {}
         if facts.get("node_type") == "array":
-            found[folder.name] = Neighbour.of(facts.get("shape", ()), partial(line, folder))
-    return found
+            neighbours[folder.name] = Neighbour.of(facts.get("shape", ()), partial(line, folder))
+    return neighbours
 
 
 def _ome(group: Path) -> dict[str, Any]:

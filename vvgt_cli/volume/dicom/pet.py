@@ -112,7 +112,7 @@ def _number(value: Any) -> float:
     """Return a finite number, of an element or of text, else 0."""
     value = getattr(value, "value", value)
     try:
-        found = float(value.decode() if isinstance(value, bytes) else value)
+        number = float(value.decode() if isinstance(value, bytes) else value)
     except (TypeError, ValueError):
         return 0.0
-    return found if math.isfinite(found) else 0.0
+    return number if math.isfinite(number) else 0.0

@@ -118,10 +118,10 @@ def _resampled(volume: Volume, heights: np.ndarray, options: ReadOptions, path: 
 
     x, y = (step * np.arange(n) for step, n in zip(volume.spacing, volume.dims[:2], strict=False))
     values = volume.data * np.float64(volume.slope) + volume.intercept
-    found = resample(rectilinear([x, y, heights]), values.ravel(), "point", options.dims, str(path), volume.name)
-    origin = tuple((np.array(volume.origin) + volume.axes @ np.array(found.origin)).tolist())
-    place: dict[str, Any] = {"spacing": found.spacing, "origin": origin, "slope": 1.0, "intercept": 0.0}
-    return replace(volume, data=found.data, name=found.name, **place)
+    sampled = resample(rectilinear([x, y, heights]), values.ravel(), "point", options.dims, str(path), volume.name)
+    origin = tuple((np.array(volume.origin) + volume.axes @ np.array(sampled.origin)).tolist())
+    place: dict[str, Any] = {"spacing": sampled.spacing, "origin": origin, "slope": 1.0, "intercept": 0.0}
+    return replace(volume, data=sampled.data, name=sampled.name, **place)
 
 
 def _segmentation(path: Path, chosen: Files, options: ReadOptions) -> Volume:
@@ -171,12 +171,12 @@ def _frames(
     if stacked and header.get("FrameIncrementPointer") in MOVIE:
         raise DataError(f"{source}: {n} frames of a film (its frames follow in time); expected slices of a volume")
     for k in range(n):
-        found = _frame(source, header, [g for g in (per_frame[k] if per_frame else None, shared) if g is not None], k,
+        frame = _frame(source, header, [g for g in (per_frame[k] if per_frame else None, shared) if g is not None], k,
                        options, stacked)  # fmt: skip
         if not stacked and mosaic is not None and _is_mosaic(header):
-            yield from _tiles(found, *mosaic)
+            yield from _tiles(frame, *mosaic)
         else:
-            yield found
+            yield frame
 
 
 def _frame(source: Source, header: Any, groups: list[Any], k: int, options: ReadOptions, stacked: bool) -> _Slice:

@@ -54,7 +54,7 @@ def segments(source: str) -> list[Segment]:
         header = pydicom.dcmread(source, stop_before_pixels=True)
         if not is_segmentation(header):
             raise DataError(f"{source}: DICOM of modality {header.get('Modality', '?')}; expected a segmentation (SEG)")
-        found = []
+        kept = []
         for one in header.get("SegmentSequence", []):
             number, lab = int(one.SegmentNumber), one.get("RecommendedDisplayCIELabValue")
             color: tuple[float, float, float] | None
@@ -63,8 +63,8 @@ def segments(source: str) -> list[Segment]:
                 color = (red / 255, green / 255, blue / 255)
             else:
                 color = _palette_color(header, number)
-            found.append(Segment(number, str(one.get("SegmentLabel", f"segment {number}")), color, _terms(one)))
-    return found
+            kept.append(Segment(number, str(one.get("SegmentLabel", f"segment {number}")), color, _terms(one)))
+    return kept
 
 
 def _terms(segment: Any) -> tuple[tuple[str, str, str], ...]:
@@ -86,13 +86,13 @@ def _palette_color(header: Any, number: int) -> tuple[float, float, float] | Non
     """Return the RGB of a segment by the palette (PS3.3, C.7.6.3.1.5 and 6); None without one."""
     if header.get("PhotometricInterpretation") != "PALETTE COLOR":
         return None
-    found = []
+    rgb = []
     for name in ("Red", "Green", "Blue"):
         count, first, bits = header[f"{name}PaletteColorLookupTableDescriptor"].value
         kind = np.dtype("u1" if bits == 8 else "<u2")
         entries = np.frombuffer(header[f"{name}PaletteColorLookupTableData"].value, kind)[: count or 1 << 16]
-        found.append(float(entries[min(max(number - first, 0), len(entries) - 1)]) / np.iinfo(kind).max)
-    return found[0], found[1], found[2]
+        rgb.append(float(entries[min(max(number - first, 0), len(entries) - 1)]) / np.iinfo(kind).max)
+    return rgb[0], rgb[1], rgb[2]
 
 
 def read_segmentation(path: Path, options: ReadOptions) -> Volume:
@@ -118,7 +118,7 @@ def read_segmentation(path: Path, options: ReadOptions) -> Volume:
         check_memory(2 * math.prod(grid.spatial_shape), source)
         chosen = _chosen(numbers, options.component, source)
         try:
-            found = read.get_volume(segment_numbers=chosen, combine_segments=True)
+            combined = read.get_volume(segment_numbers=chosen, combine_segments=True)
         except RuntimeError as error:
             if "overlap" not in str(error):
                 raise
@@ -127,12 +127,12 @@ def read_segmentation(path: Path, options: ReadOptions) -> Volume:
                 f"{len(numbers) - 1}",
                 len(numbers),
             ) from None
-    steps = found.affine[:3, 2::-1]  # of column, row and slice
+    steps = combined.affine[:3, 2::-1]  # of column, row and slice
     spacing = np.linalg.norm(steps, axis=0)
     own = segments_in(lambda: [one for one in segments(source) if one.number in chosen], source)
     return Volume(
-        np.ascontiguousarray(found.array), options.spacing_or((spacing[0], spacing[1], spacing[2])),
-        tuple(found.affine[:3, 3].tolist()), tuple((steps / spacing).ravel().tolist()),
+        np.ascontiguousarray(combined.array), options.spacing_or((spacing[0], spacing[1], spacing[2])),
+        tuple(combined.affine[:3, 3].tolist()), tuple((steps / spacing).ravel().tolist()),
         path.resolve().name.removesuffix(".dcm"), space="LPS", reference=str(read.FrameOfReferenceUID),
         segments=own,
     )  # fmt: skip

@@ -88,12 +88,12 @@ def read_file(source: Source, pixels: bool = True) -> Any:
 
     tags: Any = None if pixels else TAGS
     with Bounded(source) if isinstance(source, Path) else BytesIO(source.read_bytes()) as stream:
-        found = pydicom.dcmread(stream, force=True, stop_before_pixels=not pixels, specific_tags=tags)
-    if "TransferSyntaxUID" not in found.file_meta:  # nothing says how it is coded: as it was found to be
-        implicit, little = found.original_encoding
+        dataset = pydicom.dcmread(stream, force=True, stop_before_pixels=not pixels, specific_tags=tags)
+    if "TransferSyntaxUID" not in dataset.file_meta:  # nothing says how it is coded: as it was found to be
+        implicit, little = dataset.original_encoding
         syntax = ImplicitVRLittleEndian if implicit else ExplicitVRLittleEndian if little else ExplicitVRBigEndian
-        found.file_meta.TransferSyntaxUID = syntax
-    return found
+        dataset.file_meta.TransferSyntaxUID = syntax
+    return dataset
 
 
 def headers_in(path: Path) -> list[tuple[Source, Any]]:
@@ -120,15 +120,15 @@ def _headers(path: Path, _states: tuple[tuple[int, int], ...]) -> list[tuple[Sou
         if path.is_file() and not is_zip(path)
         else [s for s in _every(path) if s.name != "DICOMDIR" and _is_dicom_file(s)]
     )
-    found: dict[Any, tuple[Source, Any]] = {}
+    unique: dict[Any, tuple[Source, Any]] = {}
     for source in files:
         header = read_file(source, pixels=False)
         keys = ("SOPInstanceUID", "ImagePositionPatient", "InstanceNumber", "AcquisitionTime")
         key = tuple(str(header.get(key, "")) for key in keys)
-        found.setdefault(key if key[0] else source, (source, header))
-    if copies := len(files) - len(found):
+        unique.setdefault(key if key[0] else source, (source, header))
+    if copies := len(files) - len(unique):
         warnings.warn(f"{path}: skipped {copies} files that are copies of others", stacklevel=2)
-    return list(found.values())
+    return list(unique.values())
 
 
 _FEW = 2  # slices: fewer than make a stack, beside one that has more
@@ -153,11 +153,11 @@ def choose_series(headers: Sequence[tuple[Source, Any]], wanted: str | None, pat
         DataError: no images.
         UsageError: several series and none chosen, or none of that name.
     """
-    found: dict[str, Files] = {}
+    series: dict[str, Files] = {}
     for file, header in headers:
         if "Rows" in header and "Columns" in header:
-            found.setdefault(str(header.get("SeriesInstanceUID", "")), []).append((file, header))
-    if not found:
+            series.setdefault(str(header.get("SeriesInstanceUID", "")), []).append((file, header))
+    if not series:
         kinds = Counter(printable(str(header.get("Modality", "?")))[:16] for _, header in headers)
         listing = ", ".join(f"{n} {kind}" for kind, n in kinds.items()) or "no DICOM files"
         structures = kinds["RTSTRUCT"] == kinds.total() > 0
@@ -165,51 +165,51 @@ def choose_series(headers: Sequence[tuple[Source, Any]], wanted: str | None, pat
         hint = "; unpack a zip of other files" if not kinds and str(path).lower().endswith(".zip") else hint
         raise DataError(f"{path}: no DICOM images ({listing}); expected files with rows and columns of pixels{hint}")
     if wanted is None:
-        return "", _only(found, path), ""
+        return "", _only(series, path), ""
     wanted = wanted.strip("/")
     ends = [len(wanted), *(k for k in range(len(wanted) - 1, 0, -1) if wanted[k] == "/")]
     for end in ends:
-        if chosen := _named(found, wanted[:end]):
+        if chosen := _named(series, wanted[:end]):
             return f":{wanted}", chosen, wanted[end:].strip("/")
-    if len(found) == 1 and not wanted.partition("/")[0].isdecimal():
-        return f":{wanted}", next(iter(found.values())), wanted
-    raise UsageError(f"{path}: no one series {wanted!r}; it has {_listed(found)}; choose with --series SERIES")
+    if len(series) == 1 and not wanted.partition("/")[0].isdecimal():
+        return f":{wanted}", next(iter(series.values())), wanted
+    raise UsageError(f"{path}: no one series {wanted!r}; it has {_listed(series)}; choose with --series SERIES")
 
 
-def _only(found: dict[str, Files], path: Path) -> Files:
+def _only(series: dict[str, Files], path: Path) -> Files:
     """Return the single series of spatially located images, ignoring scouts and segmentations."""
     aside = {
         uid: files
-        for uid, files in found.items()
+        for uid, files in series.items()
         if all(_localiser(h) or is_segmentation(h) or not any(key in h for key in _PLACES) for _, h in files)
     }
-    left = {uid: f for uid, f in found.items() if uid not in aside} or found
+    left = {uid: f for uid, f in series.items() if uid not in aside} or series
     if len(left) > 1:
         text = (
-            f"{path}: several series: {_listed(found)}; choose one by number, UID or description with --series SERIES"
+            f"{path}: several series: {_listed(series)}; choose one by number, UID or description with --series SERIES"
         )
-        titles = [str(f[0][1].get("SeriesDescription", "")).strip() for f in found.values()]
-        raise SeveralArrays(text, "--series", list(found), titles)
-    if len(left) < len(found):
+        titles = [str(f[0][1].get("SeriesDescription", "")).strip() for f in series.values()]
+        raise SeveralArrays(text, "--series", list(series), titles)
+    if len(left) < len(series):
         warnings.warn(
             f"{path}: skipped: {_listed(aside)} (localisers, segmentations, images without a position)", stacklevel=2
         )
     return next(iter(left.values()))
 
 
-def _named(found: dict[str, Files], wanted: str) -> Files:
+def _named(series: dict[str, Files], wanted: str) -> Files:
     """Return the one series with this number, UID or description, else nothing."""
     fits = []
-    for uid, files in found.items():
+    for uid, files in series.items():
         keys = (str(files[0][1].get(key, "")).strip() for key in ("SeriesNumber", "SeriesDescription"))
         fits += [files] if wanted in (uid, *keys) else []
     return fits[0] if len(fits) == 1 else []
 
 
-def _listed(found: dict[str, Files]) -> str:
+def _listed(series: dict[str, Files]) -> str:
     """List series for an error: number, description, modality, slices, UID."""
     parts = []
-    for uid, files in found.items():
+    for uid, files in series.items():
         header = files[0][1]
         slices = sum(int(h.get("NumberOfFrames", 1) or 1) for _, h in files)
         parts.append(

@@ -117,8 +117,8 @@ def _named(volumes: list[list[Any]]) -> dict[str, list[Any]]:
     """Name volumes by the first attribute, or pair, that differs from one to the next, and order them."""
 
     def fixed(key: str) -> list[Any] | None:
-        found = [{s.facts.get(key) for s in volume} for volume in volumes]
-        return None if any(len(one) != 1 for one in found) else [one.pop() for one in found]
+        stated = [{s.facts.get(key) for s in volume} for volume in volumes]
+        return None if any(len(one) != 1 for one in stated) else [one.pop() for one in stated]
 
     table = {key: values for key in ATTRIBUTES if (values := fixed(key)) is not None and len(set(values)) > 1}
     chosen = next(((key,) for key, values in table.items() if len(set(values)) == len(volumes)), tuple(table)[:2])

@@ -36,12 +36,12 @@ def _words(file: IO[bytes], path: Path, what: str) -> list[str]:
 def _floats(words: list[str], n: int, path: Path, what: str) -> list[float]:
     """Parse the first ``n`` finite numbers of a line; raise DataError for others."""
     try:
-        found = [float(w) for w in words[:n]]
+        numbers = [float(w) for w in words[:n]]
     except ValueError:
-        found = []
-    if len(found) < n or not all(map(math.isfinite, found)):
+        numbers = []
+    if len(numbers) < n or not all(map(math.isfinite, numbers)):
         raise DataError(f"{path}: {what} is {' '.join(words)[:80]!r}; expected {n} finite numbers")
-    return found
+    return numbers
 
 
 def _whole(words: list[str], path: Path, what: str) -> int:
@@ -92,15 +92,15 @@ def _orbitals(file: IO[bytes], path: Path) -> list[str]:
     """Read the numbers of the orbitals: how many there are, then each, over as many lines as it takes."""
     words = _words(file, path, "the orbitals")
     n = _whole(words, path, "the number of orbitals")
-    found = words[1:]
-    while len(found) < n <= MAX_ORBITALS:
+    numbers = words[1:]
+    while len(numbers) < n <= MAX_ORBITALS:
         more = _words(file, path, "the orbitals")
         if not more:
             break
-        found += more
-    if not 1 <= n == len(found):
-        raise DataError(f"{path}: {n} orbitals, of which {len(found)} have a number; expected 1 to {MAX_ORBITALS}")
-    return found
+        numbers += more
+    if not 1 <= n == len(numbers):
+        raise DataError(f"{path}: {n} orbitals, of which {len(numbers)} have a number; expected 1 to {MAX_ORBITALS}")
+    return numbers
 
 
 def read_dx(path: Path, options: ReadOptions) -> Volume:
@@ -177,7 +177,7 @@ def read_vasp(path: Path, options: ReadOptions) -> Volume:
         starts = [file.tell()]
         with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
             again = rb"\n[ \t]*%d[ \t]+%d[ \t]+%d[ \t]*\r?\n" % tuple(sizes)
-            starts += [found.end() for found in re.finditer(again, text) if found.end() > starts[0]]
+            starts += [match.end() for match in re.finditer(again, text) if match.end() > starts[0]]
     blocks = [load_block(path, np.dtype("f4"), tuple(sizes[::-1]), offset=at, encoding="text") for at in starts]
     label = "its grid (total, then magnetization, or spin up and down)" if len(starts) > 1 else "its grid"
     field, _ = select_component(np.stack(blocks, axis=-1), options.component, str(path), label=label)

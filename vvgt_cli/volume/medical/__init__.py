@@ -24,16 +24,16 @@ def byte_order(head: bytes) -> tuple[str, int] | None:
 
 def is_nifti(head: bytes) -> bool:
     """Tell whether a file begins as NIfTI-1 or NIfTI-2 does."""
-    found = byte_order(head)
-    return found is not None and head[(344 if found[1] == 1 else 4) :][:4] in NIFTI_MAGIC
+    form = byte_order(head)
+    return form is not None and head[(344 if form[1] == 1 else 4) :][:4] in NIFTI_MAGIC
 
 
 def is_analyze(head: bytes) -> bool:
     """Tell whether a file begins as the header of an Analyze 7.5 pair does."""
-    found = byte_order(head)
-    if found is None or found[1] != 1 or head[344:348] in NIFTI_MAGIC:
+    form = byte_order(head)
+    if form is None or form[1] != 1 or head[344:348] in NIFTI_MAGIC:
         return False
-    axes, offset = struct.unpack_from(found[0] + "h", head, 40)[0], struct.unpack_from(found[0] + "f", head, 108)[0]
+    axes, offset = struct.unpack_from(form[0] + "h", head, 40)[0], struct.unpack_from(form[0] + "f", head, 108)[0]
     return 1 <= int(axes) <= 7 and abs(offset) < ANALYZE_OFFSET
 
 

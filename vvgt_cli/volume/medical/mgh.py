@@ -63,9 +63,9 @@ def table_entries(content: bytes) -> list[Segment]:
     def text() -> str:
         return table.read(number()).split(b"\0")[0].decode("utf-8", "replace")
 
-    _, _, found = number(), text(), list[Segment]()  # entries that there may be, file that they come from
+    _, _, entries = number(), text(), list[Segment]()  # entries that there may be, file that they come from
     for _ in range(number()):
         label, name, *color = number(), text(), number(), number(), number(), number()
         red, green, blue, clear = (value / 255 for value in color)
-        found.append(Segment(label, name, (red, green, blue), opacity=1 - clear if label else 0.0))
-    return found
+        entries.append(Segment(label, name, (red, green, blue), opacity=1 - clear if label else 0.0))
+    return entries

@@ -178,9 +178,9 @@ def _scaled(image: _Image, spatial: list[int], fixed: dict[int, int], path: Path
 
 def _along(end: np.ndarray, index: tuple[Any, ...]) -> np.ndarray:
     """Return image-min or image-max of a part of the image, with the axes of the part."""
-    found = end[index[: end.ndim]]
+    part = end[index[: end.ndim]]
     rest = sum(isinstance(i, slice) for i in index[end.ndim :])
-    return np.reshape(found, (*np.shape(found), *[1] * rest))
+    return np.reshape(part, (*np.shape(part), *[1] * rest))
 
 
 def _valid(image: _Image, path: Path) -> tuple[float, float]:
@@ -188,10 +188,10 @@ def _valid(image: _Image, path: Path) -> tuple[float, float]:
     if image.dtype.kind == "f":
         return 0.0, 1.0
     stated, info = image.attributes, np.iinfo(image.dtype)
-    found = np.ravel(stated["valid_range"]) if "valid_range" in stated else [
+    limits = np.ravel(stated["valid_range"]) if "valid_range" in stated else [
         _number(stated, key, end) for key, end in (("valid_min", info.min), ("valid_max", info.max))
     ]  # fmt: skip
-    low, high = (float(v) for v in found)
+    low, high = (float(v) for v in limits)
     if not info.min <= low < high <= info.max:
         raise DataError(f"{path}: its valid range is {low:g} to {high:g}; expected one of {image.dtype}, ascending")
     return low, high

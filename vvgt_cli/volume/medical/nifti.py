@@ -56,10 +56,10 @@ class Header:
 
 def parse_header(head: bytes, name: str) -> Header:
     """Parse the first 348 (NIfTI-1) or 540 (NIfTI-2) bytes; raise DataError if no volume of real numbers begins so."""
-    found = byte_order(head)
-    if found is None or not is_nifti(head):
+    form = byte_order(head)
+    if form is None or not is_nifti(head):
         raise DataError(f"{name}: no NIfTI header (348 or 540 bytes with the magic n+1, ni1, n+2 or ni2)")
-    order, version = found
+    order, version = form
 
     def get(fmt: str, at: int) -> tuple[Any, ...]:
         return struct.unpack_from(order + fmt, head, at)
@@ -231,10 +231,10 @@ def read_analyze(path: Path, options: ReadOptions) -> Volume:
 
 def _parse_analyze(head: bytes, name: str) -> tuple[Header, tuple[int, ...]]:
     """Parse a header, and SPM's origin: the voxel at (0, 0, 0), counted from 1; 0 where there is none."""
-    found = byte_order(head)
-    if found is None or not is_analyze(head):
+    form = byte_order(head)
+    if form is None or not is_analyze(head):
         raise DataError(f"{name}: no Analyze header (348 bytes that begin with their number)")
-    order = found[0]
+    order = form[0]
     dim, (code,) = struct.unpack_from(order + "8h", head, 40), struct.unpack_from(order + "h", head, 70)
     pixdim = struct.unpack_from(order + "8f", head, 76)
     offset, slope, intercept = struct.unpack_from(order + "3f", head, 108)

@@ -277,7 +277,7 @@ def _volume(path: Path, fields: HeaderFields, block: np.ndarray, sizes: list[int
 
 def segments(fields: HeaderFields, layer: int | None = None) -> list[Segment]:
     """Return the segments in a header of 3D Slicer's .seg.nrrd, of one layer or of all, or raise DataError."""
-    found, stated = [], dict[str, dict[str, str]]()
+    kept, stated = [], dict[str, dict[str, str]]()
     for key, value in fields.items():
         if match := _SEGMENT.fullmatch(key):
             stated.setdefault(match[1], {})[match[2]] = value
@@ -289,8 +289,8 @@ def segments(fields: HeaderFields, layer: int | None = None) -> list[Segment]:
         except ValueError:
             text = f"{fields.name}: segment {index}: label {label[:40]!r}, colour {color[:5]}; expected numbers"
             raise DataError(text) from None
-        found += [segment] if layer is None or one.get("Layer", "0") == str(layer) else []
-    return found
+        kept += [segment] if layer is None or one.get("Layer", "0") == str(layer) else []
+    return kept
 
 
 def _terms(tags: str) -> tuple[tuple[str, str, str], ...]:

@@ -46,11 +46,11 @@ def read_pair(path: Path, options: ReadOptions) -> Volume:
         def part(index: tuple[Any, ...]) -> np.ndarray:
             return np.asarray(data[index]).astype(dtype, copy=False)
 
-        found = labelled_volume(
+        volume = labelled_volume(
             part, dtype, axes, {}, replace(options, spacing=None), str(path), volume_name(path), chunks
         )
         origin = tuple(loaded.affine[:3, 3].tolist())
-        return replace(found, spacing=options.spacing_or(lengths), origin=origin, direction=direction, space="RAS")
+        return replace(volume, spacing=options.spacing_or(lengths), origin=origin, direction=direction, space="RAS")
 
 
 def _bricks(header: Any, size: int) -> Axis:

@@ -152,10 +152,10 @@ def choose_image(
     keys = keys or [str(k) for k in range(len(names))]
     listing = listed([f"{k} {n[:60]!r} ({f})" for k, n, f in zip(keys, names, facts, strict=True)])
     if wanted is not None:
-        found = [k for k, name in enumerate(names) if wanted.strip("/") in (keys[k], name)]
-        if len(found) != 1:
-            raise UsageError(f"{source}: {len(found)} {what} {wanted!r}; it has {listing}; choose with --series NAME")
-        return found[0]
+        fits = [k for k, name in enumerate(names) if wanted.strip("/") in (keys[k], name)]
+        if len(fits) != 1:
+            raise UsageError(f"{source}: {len(fits)} {what} {wanted!r}; it has {listing}; choose with --series NAME")
+        return fits[0]
     if len(names) == 1:
         return 0
     if sum(deep) != 1:
@@ -171,10 +171,10 @@ def choose_image(
 
 def hex_color(text: Any) -> Color:
     """Parse RGB in [0, 1] of ``RRGGBB`` or ``AARRGGBB``, after "#" or not; None for others, and for black."""
-    found = re.fullmatch(r"#?(?:[0-9a-fA-F]{2})?([0-9a-fA-F]{6})", text.strip()) if isinstance(text, str) else None
-    if found is None or found[1] == "000000":
+    digits = re.fullmatch(r"#?(?:[0-9a-fA-F]{2})?([0-9a-fA-F]{6})", text.strip()) if isinstance(text, str) else None
+    if digits is None or digits[1] == "000000":
         return None
-    red, green, blue = bytes.fromhex(found[1])
+    red, green, blue = bytes.fromhex(digits[1])
     return red / 255, green / 255, blue / 255
 
 

@@ -98,10 +98,10 @@ def _shape(file: Any, level: int) -> tuple[int, int, int]:
 
 def _text(value: Any) -> str:
     """Join an attribute, an array of single characters, to text."""
-    found = np.asarray(value)
-    if found.dtype.kind == "S":
-        return found.tobytes().replace(b"\0", b"").decode("utf-8", "replace").strip()
-    return "".join(map(str, found.ravel()[:4096])).strip()
+    characters = np.asarray(value)
+    if characters.dtype.kind == "S":
+        return characters.tobytes().replace(b"\0", b"").decode("utf-8", "replace").strip()
+    return "".join(map(str, characters.ravel()[:4096])).strip()
 
 
 def _placed(image: Any, shape: tuple[int, int, int]) -> tuple[Any, Any]:

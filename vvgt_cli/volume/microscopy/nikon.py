@@ -34,9 +34,9 @@ def read_nd2(path: Path, options: ReadOptions) -> Volume:
         place = _position(file, sizes, options, path)
         loops = [a for a in sizes if a not in "CYXS"]
         frames = int(np.prod([sizes[a] for a in loops], dtype=object))
-        found = sum(k in there for k in range(min(frames, MAX_FRAMES)))
-        if found < frames:
-            raise DataError(f"{path}: of {frames} frames {found} are there; check that the file is whole")
+        complete = sum(k in there for k in range(min(frames, MAX_FRAMES)))
+        if complete < frames:
+            raise DataError(f"{path}: of {frames} frames {complete} are there; check that the file is whole")
         names, colors = _channels(file)
         attributes = file.attributes
         packed = (
@@ -73,7 +73,7 @@ def _frames(path: Path) -> dict[int, int]:
         magic, title, length = CHUNK.unpack(file.read(CHUNK.size).ljust(CHUNK.size, b"\0"))
         file.seek(place + CHUNK.size + title)
         data = file.read(length)
-    found: dict[int, int] = {}
+    begins: dict[int, int] = {}
     at = 0
     while magic == CHUNK_MAGIC:
         end = data.find(b"!", at) + 1
@@ -81,9 +81,9 @@ def _frames(path: Path) -> dict[int, int]:
             break
         number = re.fullmatch(rb"ImageDataSeq\|(\d{1,10})!", data[at:end])
         if number and (begin := struct.unpack_from("<Q", data, end)[0]) < size:
-            found[int(number[1])] = begin
+            begins[int(number[1])] = begin
         at = end + 16
-    return found
+    return begins
 
 
 def _position(file: Any, sizes: dict[str, int], options: ReadOptions, path: Path) -> int:

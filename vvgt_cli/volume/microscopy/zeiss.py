@@ -98,7 +98,7 @@ def tiles_of(path: Path) -> tuple[list[CziTile], str]:
             raise DataError(f"{path}: no directory of tiles where its header says; check that the CZI file is whole")
         _fits(path, size, listing, count * ENTRY.size, "the directory of tiles")
         place = listing + SEGMENT.size + LISTING
-        found = []
+        tiles = []
         for _ in range(count):
             _, pixel, start, part, compression, _, _, axes = take(ENTRY, place, "an entry of the directory")
             place += ENTRY.size
@@ -117,10 +117,10 @@ def tiles_of(path: Path) -> tuple[list[CziTile], str]:
             begin = start + SEGMENT.size + max(DETAILS, DATA.size + ENTRY.size + axes * DIMENSION.size) + lengths[0]
             _fits(path, size, begin, lengths[2], "a tile")
             _fits(path, size, start, min(lengths), "a tile")
-            found.append(_tile(spans, (pixel, compression, begin, lengths[2]), path))
-    if not found:
+            tiles.append(_tile(spans, (pixel, compression, begin, lengths[2]), path))
+    if not tiles:
         raise DataError(f"{path}: no tiles; expected at least one")
-    return found, xml
+    return tiles, xml
 
 
 def _tile(spans: dict[str, tuple[int, int, int]], facts: tuple[int, int, int, int], path: Path) -> CziTile:
@@ -223,13 +223,13 @@ def read_czi(path: Path, options: ReadOptions) -> Volume:
 
 def _scene(tiles: list[CziTile], options: ReadOptions, path: Path) -> tuple[int | None, list[CziTile]]:
     """Return the number of the scene asked for, None where there is one, and its tiles."""
-    found: dict[int, list[CziTile]] = {}
+    scenes: dict[int, list[CziTile]] = {}
     for tile in tiles:
-        found.setdefault(tile.at.get("S", 0), []).append(tile)
-    keys = sorted(found)
-    facts = ["{2} x {3} pixels".format(*_bounds(found[k])) for k in keys]
+        scenes.setdefault(tile.at.get("S", 0), []).append(tile)
+    keys = sorted(scenes)
+    facts = ["{2} x {3} pixels".format(*_bounds(scenes[k])) for k in keys]
     number = choose_image([f"scene {k}" for k in keys], facts, options.array, "scenes", str(path))
-    return keys[number] if len(keys) > 1 else None, found[keys[number]]
+    return keys[number] if len(keys) > 1 else None, scenes[keys[number]]
 
 
 def _bounds(tiles: Sequence[CziTile]) -> tuple[int, int, int, int]:
@@ -265,8 +265,8 @@ def _read(
             x0, x1 = max(left, x.start), min(left + tile.width, x.stop)
             y0, y1 = max(top, y.start), min(top + tile.height, y.stop)
             if x0 < x1 and y0 < y1:
-                found = pixels_of(tile, path)[y0 - top : y1 - top, x0 - left : x1 - left, sample]
-                out[k - z.start, y0 - y.start : y1 - y.start, x0 - x.start : x1 - x.start] = found
+                pixels = pixels_of(tile, path)[y0 - top : y1 - top, x0 - left : x1 - left, sample]
+                out[k - z.start, y0 - y.start : y1 - y.start, x0 - x.start : x1 - x.start] = pixels
     return out
 
 
@@ -276,11 +276,11 @@ def _metadata(xml: str, channels: int, path: Path) -> tuple[Any, list[str], list
     if root is None:
         return (None, None, None), [], []
     spacing = {d.get("Id"): _micrometres(d.findtext("Value")) for d in root.findall(".//Scaling/Items/Distance")}
-    found = root.findall(".//Information/Image/Dimensions/Channels/Channel")[:channels]
-    found = found if len(found) == channels else []
+    stated = root.findall(".//Information/Image/Dimensions/Channels/Channel")[:channels]
+    stated = stated if len(stated) == channels else []
     display = {c.get("Id"): c.findtext("Color") for c in root.findall(".//DisplaySetting/Channels/Channel")}
-    colors = [hex_color(display.get(c.get("Id")) or c.findtext("Color")) for c in found]
-    return tuple(spacing.get(a) for a in "XYZ"), [c.get("Name") or "" for c in found], colors
+    colors = [hex_color(display.get(c.get("Id")) or c.findtext("Color")) for c in stated]
+    return tuple(spacing.get(a) for a in "XYZ"), [c.get("Name") or "" for c in stated], colors
 
 
 def _micrometres(text: str | None) -> float | None:

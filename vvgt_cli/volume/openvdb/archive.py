@@ -121,12 +121,12 @@ def _descriptor(cursor: Cursor) -> tuple[Grid, int]:
 def skip_metadata(cursor: Cursor) -> dict[str, bytes]:
     """Read metadata by name; values as they are stored."""
     (count,) = cursor.unpack("I")
-    found = {}
+    values = {}
     for _ in range(count):
         name, _type = cursor.text(), cursor.text()
         (size,) = cursor.unpack("I")
-        found[name] = bytes(cursor.take(size)[:64])
-    return found
+        values[name] = bytes(cursor.take(size)[:64])
+    return values
 
 
 def read_grid_head(cursor: Cursor) -> tuple[int, bool, np.ndarray]:

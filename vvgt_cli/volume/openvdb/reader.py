@@ -37,20 +37,20 @@ def choose_grid(grids: list[Grid], wanted: str | None, source: str) -> Grid:
     """
     how = "choose one with --grid NAME"
     if wanted is None:
-        found = [g for g in grids if g.readable and g.components == 1] or grids
-        densities = [g for g in found if g.name == "density"]
-        if len(found) > len(densities) == 1:
-            found = densities
-            others = listed([g.label for g in grids if g is not found[0]])
+        fits = [g for g in grids if g.readable and g.components == 1] or grids
+        densities = [g for g in fits if g.name == "density"]
+        if len(fits) > len(densities) == 1:
+            fits = densities
+            others = listed([g.label for g in grids if g is not fits[0]])
             warnings.warn(
                 f"{source}: grid density; --grid, or a --layer with array=, takes another: {others}", stacklevel=3
             )
-        names = [g.label for g in found]
+        names = [g.label for g in fits]
     else:
-        found, names = grids, [g.label for g in grids]
+        fits, names = grids, [g.label for g in grids]
         if wanted not in names:
             names, how = [g.name for g in grids], how + " (name one with its number, NAME[0], where several share it)"
-    grid = found[choose(names, list(map(str, grids)), wanted, source, "grid", how, "--grid")]
+    grid = fits[choose(names, list(map(str, grids)), wanted, source, "grid", how, "--grid")]
     if not grid.readable:
         kinds = ", ".join(TYPES)
         raise DataError(f"{source}: grid {grid}; expected values of type {kinds} in a tree 5-4-3")

@@ -164,12 +164,12 @@ class TreeReader:
         need = kept * self.stored.itemsize * max(sum(self.shape), 1)
         halved = self.stored != self.dtype
         data = b"" if halved and not kept else read_block(self.cursor, need, self.compression)
-        found = self.numbers(data, self.stored).reshape(kept, *self.shape)
+        stored = self.numbers(data, self.stored).reshape(kept, *self.shape)
         if kept == n:
-            return found
-        out = np.empty((n, *self.shape), found.dtype)
+            return stored
+        out = np.empty((n, *self.shape), stored.dtype)
         out[:] = off if choice is None else np.where(choice, second, off)
-        out[active] = found
+        out[active] = stored
         return out
 
     def leaves(self, masks: np.ndarray) -> np.ndarray:

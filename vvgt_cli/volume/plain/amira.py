@@ -86,12 +86,12 @@ def _materials(text: str) -> list[Segment]:
 
     Values of a label field count them in their order, whatever their Id is.
     """
-    found = []
+    segments = []
     for number, (name, inner) in enumerate(re.findall(r'([^\s{}"]+|"[^"\n]*")\s*\{([^{}]*)\}', text)):
         color = re.search(r"\bColor\s+([^,\n]+)", inner)
         rgb = None if color is None else triple(float(word) for word in color[1].split()[:3])
-        found.append(Segment(number, name.strip('"'), rgb))
-    return found
+        segments.append(Segment(number, name.strip('"'), rgb))
+    return segments
 
 
 def _values(

@@ -51,8 +51,8 @@ def _mapped(path: Path, fields: HeaderFields, start: str) -> np.ndarray:
     kind = _KINDS.get(stated, "")
     form, skip = fields.get(f"{start}fileformat", "raw"), fields.integer(f"{start}skipheader", 0)
     if len(sizes) != 3 or n not in _BYTES.get(kind, ()) or form != "raw" or skip < 0:
-        found = f"FileFormat {form}, Size {sizes}, Datatype {stated!r} of {8 * n} bits"
-        raise DataError(f"{path}: {found}; expected raw, three numbers, and float, or integers of up to 64 bits")
+        layout = f"FileFormat {form}, Size {sizes}, Datatype {stated!r} of {8 * n} bits"
+        raise DataError(f"{path}: {layout}; expected raw, three numbers, and float, or integers of up to 64 bits")
     if any(fields.floats("Mirror", fields.get(f"{start}mirror", "0 0 0"), 3)):
         warnings.warn(f"{path}: Mirror {fields[f'{start}mirror']} is not applied; axes are as stored", stacklevel=3)
     source = data_file(path, PureWindowsPath(fields[f"{start}name"]).name)

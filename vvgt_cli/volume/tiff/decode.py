@@ -77,11 +77,11 @@ class Pages(ExitStack):
         """Decode (rows, columns, samples) in the file's type; None for a coding that OpenImageIO lacks."""
         spec = image.spec() if image.seek_subimage(page.index, 0) else None
         if spec is not None:
-            found, expected = (
+            declared, expected = (
                 (spec.height, spec.width, spec.nchannels),
                 (keyframe.imagelength, keyframe.imagewidth, keyframe.samplesperpixel),
             )
-            if found != expected:
+            if declared != expected:
                 raise DataError(
                     f"{self._path}: page {page.index} is {spec.width} x {spec.height} x {spec.nchannels} when decoded; "
                     f"expected {expected[1]} x {expected[0]} x {expected[2]}"

@@ -114,12 +114,12 @@ def _name_files(root: ElementTree.Element, path: Path, uuid: str | None) -> None
 
 def _uuids(folder: Path) -> dict[str, str]:
     """Return the names of the OME-TIFFs in a folder, by their UUID; one that several files have is left out."""
-    found: dict[str, list[str]] = {}
+    names: dict[str, list[str]] = {}
     for file in islice(sorted(folder.iterdir()), _MOST_FILES):
         with suppress(OSError, ValueError, DataError, struct.error):  # damaged, or no TIFF
             if file.name.lower().endswith(TIFF) and (uuid := _UUID.search(_description(file))):
-                found.setdefault(uuid[1], []).append(file.name)
-    return {uuid: files[0] for uuid, files in found.items() if len(files) == 1}
+                names.setdefault(uuid[1], []).append(file.name)
+    return {uuid: files[0] for uuid, files in names.items() if len(files) == 1}
 
 
 def _check_element(element: ElementTree.Element, path: Path) -> None:

@@ -154,13 +154,13 @@ def _silent() -> Iterator[None]:
 
 def _series(file: Any, wanted: str | None, path: Path) -> tuple[Any, int]:
     """Return the series asked for, or the only one that is an image of its own, and its number."""
-    found = [(k, s) for k, s in enumerate(file.series) if not (s.keyframe.is_reduced or s.keyframe.is_mask)]
-    if not found:
+    images = [(k, s) for k, s in enumerate(file.series) if not (s.keyframe.is_reduced or s.keyframe.is_mask)]
+    if not images:
         raise DataError(f"{path}: no pages but thumbnails and masks; expected slices")
-    facts = [f"{' x '.join(map(str, s.shape))}, axes {s.axes}, {s.dtype}" for _, s in found]
-    deep = [s.kind == "ome" and "Z" in s.axes for _, s in found]  # of plain pages sizes differ by damage, too
-    names, keys = [s.name for _, s in found], [str(k) for k, _ in found]
-    number, series = found[choose_image(names, facts, wanted, "series", str(path), deep, keys)]
+    facts = [f"{' x '.join(map(str, s.shape))}, axes {s.axes}, {s.dtype}" for _, s in images]
+    deep = [s.kind == "ome" and "Z" in s.axes for _, s in images]  # of plain pages sizes differ by damage, too
+    names, keys = [s.name for _, s in images], [str(k) for k, _ in images]
+    number, series = images[choose_image(names, facts, wanted, "series", str(path), deep, keys)]
     return series, number
 
 

@@ -26,9 +26,9 @@ MAX_FILES = 100_000  # files
 
 def matching(pattern: str) -> list[Path]:
     """List the files of a glob, sorted by the numbers in their names, those of one name by their folders'."""
-    found = [path for path in map(Path, glob.glob(pattern)) if path.is_file()]
-    places = {p: [by_number(part) for part in (p, *p.parents)] for p in {path.parent for path in found}}
-    return sorted(found, key=lambda path: (by_number(path), places[path.parent]))
+    files = [path for path in map(Path, glob.glob(pattern)) if path.is_file()]
+    places = {p: [by_number(part) for part in (p, *p.parents)] for p in {path.parent for path in files}}
+    return sorted(files, key=lambda path: (by_number(path), places[path.parent]))
 
 
 def slices_of(folder: Path) -> list[Path]:

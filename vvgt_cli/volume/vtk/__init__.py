@@ -48,8 +48,8 @@ def is_index(head: bytes) -> bool:
 def is_legacy(head: bytes, grid: bool) -> bool:
     """Tell whether a file begins as a legacy VTK file of a mesh or grid (`LEGACY_GRIDS`), or of anything else."""
     kind = re.search(rb"\n\s*DATASET\s+(\w+)", head[:1024], re.IGNORECASE)
-    found = kind is not None and kind[1].decode().upper() in LEGACY_GRIDS
-    return head[:64].lower().startswith(b"# vtk datafile version") and found == grid
+    is_grid = kind is not None and kind[1].decode().upper() in LEGACY_GRIDS
+    return head[:64].lower().startswith(b"# vtk datafile version") and is_grid == grid
 
 
 def is_cgns(head: bytes) -> bool:

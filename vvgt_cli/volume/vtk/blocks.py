@@ -103,7 +103,7 @@ def walk_xml(
 
 
 def _arrays(path: Path, word: np.dtype, compressed: bool) -> list[_Array]:
-    found: list[_Array] = []
+    arrays: list[_Array] = []
     inside = False
 
     def start(tag: str, attributes: dict[str, str], _: int) -> bool:
@@ -111,19 +111,19 @@ def _arrays(path: Path, word: np.dtype, compressed: bool) -> list[_Array]:
         inside = tag in ("DataArray", "Array")
         if inside:
             inline = compressed and attributes.get("format") == "binary"
-            found.append(_Array(attributes, wanted=4 * word.itemsize if inline else 0))
+            arrays.append(_Array(attributes, wanted=4 * word.itemsize if inline else 0))
         return tag == "AppendedData"
 
     def text(data: str) -> None:
         if inside:
-            found[-1].add(data, word)
+            arrays[-1].add(data, word)
 
     def end(tag: str) -> None:
         nonlocal inside
         inside = False
 
     walk_xml(path, start, end, text)
-    return found
+    return arrays
 
 
 def _decode(text: bytes, word: np.dtype) -> np.ndarray:

@@ -37,6 +37,7 @@ from vvgt_cli.volume.vtk.resample import MAX_EDGE
 SECONDS, A_BYTE, A_VOXEL = 60, 1e-6, 4e-6  # processor time: at least, of a byte of the files, of a sample
 START = f"from {__name__} import main; main()"
 IDLE, LOOK = 60.0, 2.0  # s without any processor time after which it counts as hung, and between looks
+STOPPED = {-getattr(signal, name, -1 << 30) for name in ("SIGXCPU", "SIGKILL")}  # exit statuses; no others on Windows
 KEYS = ("dims", "spacing", "array", "component", "time")
 MAX_ROWS = 50  # of steps, arrays or blocks each that `contents_of` lists
 LARGEST = 1 << 20  # bytes of the line of an answer
@@ -51,12 +52,12 @@ def volume_by_child(program: str, path: Path, options: ReadOptions) -> Volume:
 
 def read_indexed(path: Path, options: ReadOptions) -> Volume:
     """Read what an index names: a single file as that file's reader does, several as one volume."""
-    found = _single(read_index(path), options.time)
-    if found is None:
+    single = _single(read_index(path), options.time)
+    if single is None:
         return volume_by_child(INDEX, path, options)
     from vvgt_cli.volume.registry import read_volume
 
-    file, time = found
+    file, time = single
     return read_volume(str(file), replace(options, time=time, crop=None, mask=None))
 
 
@@ -86,10 +87,10 @@ def _asked(program: str, path: Path, options: ReadOptions, task: str) -> tuple[d
         "program": program, "path": str(path), "task": task, "free": free_memory(), "seconds": seconds,
         "options": {key: getattr(options, key) for key in KEYS},
     }  # fmt: skip
-    found, status = run(request)
-    if found is None:
+    reply, status = run(request)
+    if reply is None:
         raise _ended(path, program, status, seconds)
-    facts, values = found
+    facts, values = reply
     for line in facts.pop("notes", ()):
         warnings.warn(line, stacklevel=2)
     if "error" in facts:
@@ -110,13 +111,13 @@ def run(request: dict[str, Any]) -> tuple[tuple[dict[str, Any], np.ndarray] | No
             with suppress(BrokenPipeError):  # it has ended: what it left says how
                 to.write(json.dumps(request).encode() + b"\n")
                 to.close()
-            found = received(back)
+            reply = received(back)
         except BaseException:
             child.kill()
             raise
         finally:
             ended.set()
-    return found, child.returncode
+    return reply, child.returncode
 
 
 def _watch(child: subprocess.Popen[bytes], ended: Event) -> None:
@@ -163,7 +164,7 @@ def received(stream: IO[bytes]) -> tuple[dict[str, Any], np.ndarray] | None:
 
 def _ended(path: Path, program: str, status: int, seconds: int) -> DataError:
     who = "ecCodes" if program == GRIB else f"VTK's reader of {'VTK' if program in (INDEX, SINGLE) else program} files"
-    if status in (-signal.SIGXCPU, -signal.SIGKILL):
+    if status in STOPPED:
         return DataError(
             f"{path}: {who} was stopped (after {seconds} s, a minute of standstill, or for its memory); is it whole?"
         )
@@ -243,8 +244,11 @@ def _work(program: str, path: Path, options: ReadOptions, task: str) -> tuple[di
 
 
 def bound(free: int | None, seconds: int) -> None:
-    """Let this process have ``free`` bytes more, and ``seconds`` of processor time."""
-    import resource
+    """Let this process have ``free`` bytes more, and ``seconds`` of processor time, if the system has limits."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return
 
     pages = int(Path("/proc/self/statm").read_text().split()[0]) if Path("/proc/self/statm").exists() else 0
     if free is not None and pages:
@@ -313,8 +317,8 @@ def _dataset(path: Path, above: tuple[Path, ...]) -> Iterator[Leaf]:
         reader = _reader(path, kind, head)
         reader.SetFileName(str(path))
         reader.Update()
-        found = checked(reader.GetOutputDataObject(0), reader, message, path, "it")
-    yield from leaves_of(found)
+        data = checked(reader.GetOutputDataObject(0), reader, message, path, "it")
+    yield from leaves_of(data)
 
 
 def _reader(path: Path, kind: str | None, head: bytes) -> Any:

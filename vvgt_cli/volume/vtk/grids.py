@@ -24,22 +24,22 @@ from vvgt_cli.volume.vtk.xml import GHOSTS, HIDDEN, around, extent_dims, scan, s
 
 def check_xml_grid(path: Path) -> str:
     """Return the type of a ``.vtu``, ``.vtr`` or ``.vts``; raise DataError if it cannot hold what it declares."""
-    found = scan(path)
-    points, cells = found.points, found.cells
-    if found.image:
-        dims = extent_dims(found.image, path)
+    header = scan(path)
+    points, cells = header.points, header.cells
+    if header.image:
+        dims = extent_dims(header.image, path)
         points, cells = count(tuple(dims)), count(tuple(max(d - 1, 1) for d in dims))
-    need = 12 * points if found.kind == "StructuredGrid" else 0
-    if found.kind == "UnstructuredGrid":
+    need = 12 * points if header.kind == "StructuredGrid" else 0
+    if header.kind == "UnstructuredGrid":
         need = 12 * points + 5 * cells  # coordinates; an offset and a type a cell
-    for info, _ in found.arrays:
+    for info, _ in header.arrays:
         need += (points if info.where == "point" else cells) * info.components * np.dtype(info.dtype).itemsize
     size = path.stat().st_size
-    if need > size * stored_ratio(found, path):
+    if need > size * stored_ratio(header, path):
         raise DataError(f"{path}: {size_text(size)} cannot hold {points} points and {cells} cells; is the file whole?")
     check_memory(need, str(path))
-    check_blocks(path, found.root, found.appended, found.data_start, stored_ratio(found, path))
-    return found.kind
+    check_blocks(path, header.root, header.appended, header.data_start, stored_ratio(header, path))
+    return header.kind
 
 
 class _Sections(Parser):
@@ -100,8 +100,8 @@ def dataset_volume(mesh: Any, options: ReadOptions, source: str, name: str) -> V
     mesh = shown(mesh)
     values = values_of(mesh, info).reshape(1, 1, -1, info.components)
     field = select_from_array(values, info, options.component, source)
-    found = resample(mesh, field.ravel(), info.where, options.dims, source, name)
-    return replace(found, quantity=printable(info.name))
+    volume = resample(mesh, field.ravel(), info.where, options.dims, source, name)
+    return replace(volume, quantity=printable(info.name))
 
 
 def values_of(mesh: Any, info: ArrayInfo) -> np.ndarray:
@@ -118,7 +118,7 @@ def arrays_of(mesh: Any) -> list[ArrayInfo]:
     from vtkmodules.util.numpy_support import get_vtk_to_numpy_typemap
 
     types = get_vtk_to_numpy_typemap()
-    found = []
+    infos = []
     for where, data in (("point", mesh.GetPointData()), ("cell", mesh.GetCellData())):
         active = data.GetScalars()
         for k in range(data.GetNumberOfArrays()):
@@ -128,8 +128,8 @@ def arrays_of(mesh: Any) -> list[ArrayInfo]:
             if not array.GetName():
                 array.SetName(f"array{k}")
             dtype = np.dtype(types[array.GetDataType()]).name
-            found.append(ArrayInfo(array.GetName(), where, array.GetNumberOfComponents(), dtype, array is active))
-    return found
+            infos.append(ArrayInfo(array.GetName(), where, array.GetNumberOfComponents(), dtype, array is active))
+    return infos
 
 
 def check_cells(mesh: Any, source: str) -> None:

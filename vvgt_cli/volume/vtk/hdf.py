@@ -87,7 +87,7 @@ def _offset(h5py: Any, file: Any, path: Path, info: ArrayInfo, time: int) -> int
 
 
 def _arrays(h5py: Any, root: Any, timed: bool) -> list[ArrayInfo]:
-    found = []
+    infos = []
     for where, name in GROUPS.items():
         group = root.get(name)
         if not isinstance(group, h5py.Group):
@@ -96,5 +96,5 @@ def _arrays(h5py: Any, root: Any, timed: bool) -> list[ArrayInfo]:
         for key, data in group.items():
             if isinstance(data, h5py.Dataset) and data.dtype.kind in "iuf" and len(data.shape) - timed in (3, 4):
                 components = 1 if len(data.shape) - timed == 3 else int(data.shape[-1])
-                found.append(ArrayInfo(key, where, components, data.dtype.name, key == active))
-    return found
+                infos.append(ArrayInfo(key, where, components, data.dtype.name, key == active))
+    return infos

@@ -79,48 +79,48 @@ def read_index(path: Path) -> Index:
         raise DataError(f"{path}: {size} bytes; expected an index of at most {MAX_BYTES >> 20} MiB")
     with open(path, "rb") as file:
         head = file.read(4096).removeprefix(MARK).lstrip()
-    found = _series(path) if head.startswith(b"{") else _parse(path)
-    if not found.entries:
+    index = _series(path) if head.startswith(b"{") else _parse(path)
+    if not index.entries:
         raise DataError(f"{path}: an index that names no files; expected those of a dataset")
-    return found
+    return index
 
 
 def _series(path: Path) -> Index:
     """Read ParaView's ``{"file-series-version": "1.0", "files": [{"name": ..., "time": ...}]}``."""
-    found = Index(path, "series")
+    index = Index(path, "series")
     try:
         rows = json.loads(path.read_text("utf-8-sig"))["files"]
         for k, row in enumerate(rows):
             time = float(row.get("time", k))
-            _add(found, Entry(str(row["name"]), time if math.isfinite(time) else float(k)))
+            _add(index, Entry(str(row["name"]), time if math.isfinite(time) else float(k)))
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         text = " ".join(str(error).split())
         raise DataError(
             f"{path}: damaged ({text}); expected ParaView's JSON of a series, a name and a time for each file"
         ) from error
-    return found
+    return index
 
 
-def _add(found: Index, entry: Entry) -> None:
-    if len(found.entries) >= MAX_FILES:
-        raise DataError(f"{found.path}: an index of more than {MAX_FILES} files; expected fewer")
-    found.entries.append(entry)
+def _add(index: Index, entry: Entry) -> None:
+    if len(index.entries) >= MAX_FILES:
+        raise DataError(f"{index.path}: an index of more than {MAX_FILES} files; expected fewer")
+    index.entries.append(entry)
 
 
 def _parse(path: Path) -> Index:
-    found = Index(path, "")
+    index = Index(path, "")
     blocks: list[tuple[str, str, int]] = []  # tag, name, level
 
     def start(tag: str, attributes: dict[str, str], _: int) -> None:
         if tag == "VTKFile":
-            found.kind = attributes.get("type", "")
+            index.kind = attributes.get("type", "")
         name = attributes.get("name") or attributes.get("index", "")
         level = int(attributes.get("level", blocks[-1][2] if blocks else 0))
         file = attributes.get("Source" if tag == "Piece" else "file")
         if file and tag in ("DataSet", "Piece"):
-            time = float(attributes.get("timestep") or "nan") if found.kind == "Collection" else math.nan
+            time = float(attributes.get("timestep") or "nan") if index.kind == "Collection" else math.nan
             label = "/".join([block[1] for block in blocks if block[1]] + [name or attributes.get("part", "")])
-            _add(found, Entry(file, time, level, label.strip("/")))
+            _add(index, Entry(file, time, level, label.strip("/")))
         if tag in ("Block", "Partitions"):
             if len(blocks) > 100:
                 raise DataError(f"{path}: more than 100 blocks within each other; expected fewer")
@@ -134,9 +134,9 @@ def _parse(path: Path) -> Index:
         walk_xml(path, start, end)
     except ValueError as error:
         raise DataError(f"{path}: a number in it is none ({error}); check that the file is whole") from error
-    if found.kind == "Collection" and any(math.isinf(entry.time) for entry in found.entries):
+    if index.kind == "Collection" and any(math.isinf(entry.time) for entry in index.entries):
         raise DataError(f"{path}: a time step that is not finite; expected numbers")
-    return found
+    return index
 
 
 def files_of(index: Index, entries: list[Entry], above: tuple[Path, ...] = ()) -> Iterator[tuple[Path, Entry]]:

@@ -31,13 +31,13 @@ def read_vtkjs(folder: Path, options: ReadOptions) -> Volume:
     index, source = folder / INDEX, str(folder)
     with library_errors(source, "vtk.js"):
         with open(index, "rb") as file:
-            found: dict[str, Any] = json.loads(file.read(MAX_HEADER))
-        if found.get("vtkClass") != "vtkImageData":
+            facts: dict[str, Any] = json.loads(file.read(MAX_HEADER))
+        if facts.get("vtkClass") != "vtkImageData":
             raise DataError(
-                f"{index}: a {str(found.get('vtkClass'))[:40]}; expected vtkImageData: save it as .vtu or .vti"
+                f"{index}: a {str(facts.get('vtkClass'))[:40]}; expected vtkImageData: save it as .vtu or .vti"
             )
-        extent = np.array(found["extent"], np.int64).reshape(3, 2)
-        data = {str(one["data"]["name"]): one["data"] for one in found.get("pointData", {}).get("arrays", [])}
+        extent = np.array(facts["extent"], np.int64).reshape(3, 2)
+        data = {str(one["data"]["name"]): one["data"] for one in facts.get("pointData", {}).get("arrays", [])}
         infos = [
             ArrayInfo(name, "point", int(one.get("numberOfComponents", 1)), np.dtype(_TYPES[one["dataType"]]).name)
             for name, one in data.items()
@@ -49,8 +49,8 @@ def read_vtkjs(folder: Path, options: ReadOptions) -> Volume:
         place = data_file(index, f"{name}.gz" if packed else name)
         dtype = np.dtype(info.dtype).newbyteorder(">" if ref.get("encode") == "BigEndian" else "<")
         block = load_block(place, dtype, shape, encoding="gzip" if packed else "raw")
-        axes = np.array(found.get("direction", IDENTITY), np.float64).reshape(3, 3)  # one axis after the other
-        steps = axes * np.reshape(np.array(found["spacing"], np.float64), (3, 1))
-        origin = np.array(found["origin"], np.float64) + extent[:, 0] @ steps
+        axes = np.array(facts.get("direction", IDENTITY), np.float64).reshape(3, 3)  # one axis after the other
+        steps = axes * np.reshape(np.array(facts["spacing"], np.float64), (3, 1))
+        origin = np.array(facts["origin"], np.float64) + extent[:, 0] @ steps
     field, _ = select_component(block, options.component, source, label=f"array {info.name!r}")
     return placed(field, steps, origin, options, folder.resolve().name)

@@ -62,14 +62,14 @@ def leaves_of(root: Any, name: str = "") -> Iterator[Leaf]:
 
 def arrays_in(leaves: Sequence[Leaf]) -> list[ArrayInfo]:
     """List the arrays of all datasets, each once."""
-    found: dict[tuple[str, str], ArrayInfo] = {}
+    infos: dict[tuple[str, str], ArrayInfo] = {}
     for leaf in leaves:
         for info in arrays_of(leaf.data):
-            before = found.get((info.name, info.where))
-            found[info.name, info.where] = (
+            before = infos.get((info.name, info.where))
+            infos[info.name, info.where] = (
                 info if before is None else replace(before, active=before.active or info.active)
             )
-    return list(found.values())
+    return list(infos.values())
 
 
 def volume_of(leaves: Sequence[Leaf], options: ReadOptions, source: str, name: str) -> Volume:
@@ -103,8 +103,8 @@ def volume_of(leaves: Sequence[Leaf], options: ReadOptions, source: str, name: s
         _paint(leaf.data, values, info.where, grid, out)
     inside = ~np.isnan(out)
     if lattice is None:
-        found = sampled_volume(out, inside, dtype, grid, options.dims, source, name)
-        return replace(found, quantity=printable(info.name))
+        volume = sampled_volume(out, inside, dtype, grid, options.dims, source, name)
+        return replace(volume, quantity=printable(info.name))
     whole = inside.all() and dtype.kind in "iu"
     kept = out.astype(dtype) if whole else out
     return Volume(kept, grid.spacing, grid.origin, name=name, quantity=printable(info.name))

@@ -37,11 +37,11 @@ def quiet_vtk() -> Iterator[Any]:
         vtkLogger.SetStderrVerbosity(verbosity)
 
 
-def checked(found: Any, reader: Any, message: Any, path: object, what: str) -> Any:
+def checked(output: Any, reader: Any, message: Any, path: object, what: str) -> Any:
     """Return what a reader found; warn of its warnings, and raise DataError that it cannot read ``what`` for errors."""
     error, note = message(errors=True), message()
-    if error or reader.GetErrorCode() or found is None:
+    if error or reader.GetErrorCode() or output is None:
         raise DataError(f"{path}: VTK cannot read {what} ({error or note or 'no message'}); is the file whole?")
     if note:
         warnings.warn(f"{path}: VTK says: {note}", stacklevel=3)
-    return found
+    return output

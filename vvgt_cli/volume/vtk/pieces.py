@@ -35,13 +35,13 @@ def read_pvti(path: Path, options: ReadOptions) -> Volume:
 
     With ``options.stored`` values stay in the pieces, which are mapped, or unpacked and kept for a while.
     """
-    found = scan(path)
-    if found.kind != "PImageData" or not found.image:
-        raise DataError(f"{path}: a VTK file of type {found.kind or 'unknown'}; expected PImageData (.pvti)")
-    if not found.sources:
+    header = scan(path)
+    if header.kind != "PImageData" or not header.image:
+        raise DataError(f"{path}: a VTK file of type {header.kind or 'unknown'}; expected PImageData (.pvti)")
+    if not header.sources:
         raise DataError(f"{path}: an index without pieces; expected the files of an image")
-    info = found.infos[choose_array(found.infos, options.array, str(path))]
-    pieces = _Pieces(found, info, options, path)
+    info = header.infos[choose_array(header.infos, options.array, str(path))]
+    pieces = _Pieces(header, info, options, path)
     grid = image_grid(pieces.image, info.where, path)
     shape, dtype = grid.dims[::-1], pieces.dtype
     field: Any = Stored(pieces.read, dtype, shape, pieces.chunks, str(path))
@@ -94,10 +94,10 @@ class _Pieces:
     def _scan(self, k: int) -> Scan:
         """Scan the file of piece ``k``, which lies in the folder of the index."""
         file = data_file(self.path, self.names[k])
-        found = scan(file)
-        if found.kind != "ImageData" or not found.image:
-            raise DataError(f"{file}: a VTK file of type {found.kind or 'unknown'}; expected ImageData, a piece")
-        return found
+        header = scan(file)
+        if header.kind != "ImageData" or not header.image:
+            raise DataError(f"{file}: a VTK file of type {header.kind or 'unknown'}; expected ImageData, a piece")
+        return header
 
     def _dtype(self, document: Scan) -> np.dtype:
         """Return the type of the values: that of the index, or what NaN and magnitudes need."""
@@ -158,25 +158,25 @@ class _Pieces:
         return sum(volume.data.nbytes for volume, _ in self._kept.values() if not is_file_backed(volume))
 
     def _opened(self, k: int) -> tuple[Volume, np.ndarray]:
-        found, file = self._scan(k), self.path.parent / self.names[k]
-        row = found.find(self.info.name, self.info.where)
+        header, file = self._scan(k), self.path.parent / self.names[k]
+        row = header.find(self.info.name, self.info.where)
         if row is None or (row[0].dtype, row[0].components) != (self.info.dtype, self.info.components):
             text = "none of that name" if row is None else str(row[0])
             raise DataError(f"{file}: {text}; expected {self.info} as {self.path.name} says")
-        grid = image_grid(found.image, self.info.where, file)
-        extent = np.array(extent_of(found.image["WholeExtent"], file)).reshape(3, 2)
+        grid = image_grid(header.image, self.info.where, file)
+        extent = np.array(extent_of(header.image["WholeExtent"], file)).reshape(3, 2)
         first = extent[:, 0] - self._first
         inside = (first <= self._lo[k]).all() and (first + grid.dims >= self._hi[k]).all()
         step = {key: self.image.get(key) for key in ("Origin", "Spacing", "Direction")}
-        own = {**found.image, **{key: value for key, value in step.items() if value is not None}}
+        own = {**header.image, **{key: value for key, value in step.items() if value is not None}}
         place = image_grid(own, self.info.where, file)
         off = np.abs(np.subtract(grid.origin, place.origin)).max() > CLOSE * min(place.spacing)
         if not inside or off:
             raise DataError(
-                f"{file}: an image of extent {extent.ravel().tolist()} from {found.image.get('Origin')}; expected the "
+                f"{file}: an image of extent {extent.ravel().tolist()} from {header.image.get('Origin')}; expected the "
                 f"place that {self.path.name} gives it"
             )
-        values = image_values(found, row[0], grid, self.options, file)
+        values = image_values(header, row[0], grid, self.options, file)
         return Volume(values, triple(grid.spacing), name=file.name), first
 
 
@@ -193,7 +193,7 @@ def contents_of(path: Path, options: ReadOptions) -> dict[str, Any]:
     pieces = [scan(data_file(path, name)) for name, _ in index.sources[:LISTED]]
     rows = []
     for info in index.infos:
-        stated = [found[1] for piece in pieces if (found := piece.find(info.name, info.where))]
+        stated = [match[1] for piece in pieces if (match := piece.find(info.name, info.where))]
         row: dict[str, Any] = {
             "array": info.name,
             "data": info.where,

@@ -62,8 +62,8 @@ def read_program(
             reader.Update()
         else:
             reader.UpdateTimeStep(chosen)
-        found = reader.GetOutputDataObject(0)
-        leaves = [leaf for leaf in leaves_of(found) if leaf.data.GetNumberOfPoints() > 0]
+        output = reader.GetOutputDataObject(0)
+        leaves = [leaf for leaf in leaves_of(output) if leaf.data.GetNumberOfPoints() > 0]
         error, errors = message(errors=True) or first_error, message(errors=True, every=True)
     if program.skips and leaves and error and not first_error and _mesh_is_sound(program, path, chosen):
         held = {info.name for info in arrays_in(leaves)}
@@ -254,8 +254,8 @@ def _plot3d(path: Path) -> Any:
             )
     else:
         for key, suffix in (("q", ".q"), ("function", ".f")):
-            if (found := any_case(path.with_suffix(suffix))).is_file():
-                files[key] = found.name
+            if (beside := any_case(path.with_suffix(suffix))).is_file():
+                files[key] = beside.name
     if len(files) < 2:
         raise DataError(f"{path}: coordinates alone; expected values beside them, in {path.stem}.q or {path.stem}.f")
     _check_names(path, list(files.values()))

@@ -86,10 +86,10 @@ def probe(mesh: Any, values: np.ndarray, where: str, grid: Samples) -> tuple[np.
     filtered.SetInputData(image)
     filtered.SetSourceData(single)
     filtered.Update()
-    found = filtered.GetOutput().GetPointData()
-    inside = vtk_to_numpy(found.GetArray(filtered.GetValidPointMaskArrayName())).astype(bool)
+    sampled = filtered.GetOutput().GetPointData()
+    inside = vtk_to_numpy(sampled.GetArray(filtered.GetValidPointMaskArrayName())).astype(bool)
     shape = grid.dims[::-1]
-    return vtk_to_numpy(found.GetArray("values")).reshape(shape), inside.reshape(shape)
+    return vtk_to_numpy(sampled.GetArray("values")).reshape(shape), inside.reshape(shape)
 
 
 def sampled_volume(

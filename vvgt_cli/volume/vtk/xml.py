@@ -69,36 +69,36 @@ class Scan:
 
 def scan(path: Path) -> Scan:
     """Scan the elements of a VTK XML file, up to its appended data; raise DataError if it is damaged or no VTKFile."""
-    found = Scan()
+    header = Scan()
 
     def start(tag: str, attributes: dict[str, str], position: int) -> bool:
         if tag == "VTKFile":
-            found.root, found.kind = attributes, attributes.get("type", "")
+            header.root, header.kind = attributes, attributes.get("type", "")
         elif tag.removeprefix("P") in ("ImageData", "RectilinearGrid", "StructuredGrid"):
-            found.image = attributes
+            header.image = attributes
         elif tag == "Piece":
-            found.pieces += 1
-            found.points += int(attributes.get("NumberOfPoints", "0"))
-            found.cells += int(attributes.get("NumberOfCells", "0"))
+            header.pieces += 1
+            header.points += int(attributes.get("NumberOfPoints", "0"))
+            header.cells += int(attributes.get("NumberOfCells", "0"))
             if "Source" in attributes:
-                found.sources.append((attributes["Source"], attributes.get("Extent", "")))
+                header.sources.append((attributes["Source"], attributes.get("Extent", "")))
         elif tag in DATA:
-            found.where = DATA[tag]
-            found.active[found.where] = attributes.get("Scalars", "")
-        elif tag in ("DataArray", "PDataArray") and found.where and found.pieces == (tag == "DataArray"):
-            _note_array(found, attributes, path)
+            header.where = DATA[tag]
+            header.active[header.where] = attributes.get("Scalars", "")
+        elif tag in ("DataArray", "PDataArray") and header.where and header.pieces == (tag == "DataArray"):
+            _note_array(header, attributes, path)
         elif tag == "AppendedData":
-            found.appended, found.data_start = attributes.get("encoding", ""), position
-        return found.data_start >= 0
+            header.appended, header.data_start = attributes.get("encoding", ""), position
+        return header.data_start >= 0
 
     def end(tag: str) -> None:
         if tag in DATA:
-            found.where = ""
+            header.where = ""
 
     walk_xml(path, start, end)
-    if found.data_start >= 0:
+    if header.data_start >= 0:
         with open(path, "rb") as file:
-            file.seek(found.data_start)
+            file.seek(header.data_start)
             mark = re.match(rb"[^>]*>\s*_", file.read(4096))
             file.seek(max(path.stat().st_size - TAIL, 0))
             ends = b"</VTKFile" in file.read()
@@ -106,8 +106,8 @@ def scan(path: Path) -> Scan:
             raise DataError(f"{path}: it does not end with </VTKFile>; the file was cut off, copy or write it again")
         if mark is None:  # VTK's reader would begin elsewhere
             raise DataError(f"{path}: its appended data do not begin with _; check that the file is whole")
-        found.data_start += mark.end()
-    return found
+        header.data_start += mark.end()
+    return header
 
 
 def _note_array(document: Scan, attributes: dict[str, str], path: Path) -> None:
@@ -184,16 +184,16 @@ def image_grid(image: dict[str, str], where: str, path: Path) -> Grid:
 
 def read_vti(path: Path, options: ReadOptions) -> Volume:
     """Read a VTK XML image: point data, or cell data on the grid of cell centres."""
-    found = scan(path)
-    if found.kind != "ImageData" or not found.image:
+    header = scan(path)
+    if header.kind != "ImageData" or not header.image:
         raise DataError(
-            f"{path}: a VTK file of type {found.kind or 'unknown'}; expected ImageData (.vti); resample it first "
+            f"{path}: a VTK file of type {header.kind or 'unknown'}; expected ImageData (.vti); resample it first "
             "(ParaView: Resample To Image)"
         )
-    infos = found.infos
+    infos = header.infos
     info = infos[choose_array(infos, options.array, str(path))]
-    grid = image_grid(found.image, info.where, path)
-    values = image_values(found, info, grid, options, path)
+    grid = image_grid(header.image, info.where, path)
+    values = image_values(header, info, grid, options, path)
     place = options.spacing_or(grid.spacing), grid.origin, grid.direction
     return Volume(values, *place, volume_name(path), quantity=printable(info.name))
 

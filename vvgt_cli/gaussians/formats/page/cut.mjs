@@ -69,9 +69,9 @@ export function cutOf(look, { axes, box: [low, high] }, { app }, history, change
   flip.addEventListener('click', () => { history.keep(); change({ flipped: !now.flipped }); });
 
   const numbers = (texts, count) => {
-    const found = texts.map(Number);
-    if (found.length !== count || !found.every(Number.isFinite)) throw new Error('not a cut');
-    return found;
+    const values = texts.map(Number);
+    if (values.length !== count || !values.every(Number.isFinite)) throw new Error('not a cut');
+    return values;
   };
   const share = (x) => Math.min(Math.max(x / 1000, 0), 1);
   const part = {
@@ -90,10 +90,10 @@ export function cutOf(look, { axes, box: [low, high] }, { app }, history, change
         if ([0, 2, 4].some((j) => box[j] >= box[j + 1])) throw new Error('not a cut');
         return { ...NONE, kind: 'box', box };
       }
-      const found = numbers(flipped ? rest.slice(0, -1) : rest, word === 'plane' ? 4 : 1), length = Math.hypot(...found.slice(0, 3));
+      const values = numbers(flipped ? rest.slice(0, -1) : rest, word === 'plane' ? 4 : 1), length = Math.hypot(...values.slice(0, 3));
       if (word === 'plane' ? !length : k < 0 || word.length !== 1) throw new Error('not a cut');
-      const normal = word === 'plane' ? found.slice(0, 3).map((x) => x / length) : axes[k];
-      return { ...NONE, kind: 'plane', normal, at: share(found.at(-1)), flipped };
+      const normal = word === 'plane' ? values.slice(0, 3).map((x) => x / length) : axes[k];
+      return { ...NONE, kind: 'plane', normal, at: share(values.at(-1)), flipped };
     },
   };
   history.add(part);

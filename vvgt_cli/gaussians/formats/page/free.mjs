@@ -29,20 +29,20 @@ function freePart({ clientWidth: width, clientHeight: height }, scene, angles) {
   const over = [...document.querySelectorAll(OVER)].map((element) => element.getBoundingClientRect())
     .map((r) => ({ left: Math.max(r.left, 0), right: Math.min(r.right, width), top: Math.max(r.top, 0), bottom: Math.min(r.bottom, height) }))
     .filter(({ left, right, top, bottom }) => left < right && top < bottom);
-  const whole = { x: width / 2, y: height / 2, wide: width, high: height, ...fitting(scene, angles, width, height) }, found = [];
+  const whole = { x: width / 2, y: height / 2, wide: width, high: height, ...fitting(scene, angles, width, height) }, parts = [];
   const edges = (side, end) => [end, ...over.map((r) => r[side])];
   for (const left of edges('right', 0)) for (const right of edges('left', width)) for (const top of edges('bottom', 0)) for (const bottom of edges('top', height)) {
     if (left >= right || top >= bottom || over.some((r) => r.left < right && r.right > left && r.top < bottom && r.bottom > top)) continue;
-    found.push({ x: (left + right) / 2, y: (top + bottom) / 2, wide: right - left, high: bottom - top, ...fitting(scene, angles, right - left, bottom - top, Math.max(width, height, 1)) });
+    parts.push({ x: (left + right) / 2, y: (top + bottom) / 2, wide: right - left, high: bottom - top, ...fitting(scene, angles, right - left, bottom - top, Math.max(width, height, 1)) });
   }
-  const least = Math.min(...found.map((part) => part.distance)), aside = (part) => Math.hypot(part.x - whole.x, part.y - whole.y);
+  const least = Math.min(...parts.map((part) => part.distance)), aside = (part) => Math.hypot(part.x - whole.x, part.y - whole.y);
   if (!(least < FARTHEST * whole.distance)) return { ...whole, least: whole.distance };
-  return { ...found.filter((part) => part.distance <= ALIKE * least).sort((a, b) => aside(a) - aside(b) || a.distance - b.distance)[0], least };
+  return { ...parts.filter((part) => part.distance <= ALIKE * least).sort((a, b) => aside(a) - aside(b) || a.distance - b.distance)[0], least };
 }
 
 // Keeps the middle of the view in the middle of that part when panels open and the window changes; until somebody moves the
 // view, all fits. draw(): letters and legend where they belong in the window as it is.
-// {fit(angles): to a view that fits; times(angles): how far the eye stands back for the window, in distances for a square picture alone; turn(app, still): turns slowly until somebody does something, but not while still()}
+// {fit(angles): to a view that fits; times(angles): how far the eye stands back for the window, in distances for a square picture alone; turn(app, still): turns slowly until somebody does something, but not while still() or out of sight}
 export function stayFree(lens, scene, draw) {
   let fitted = null, turning = false;
   const { canvas } = lens, numbers = ({ target, pitch, yaw, distance }) => [...target, pitch, yaw, distance];
@@ -69,10 +69,12 @@ export function stayFree(lens, scene, draw) {
     turn(app, still) {
       if (matchMedia('(prefers-reduced-motion: reduce)').matches || !untouched()) return;
       turning = true;
+      let seen = true;
+      new IntersectionObserver(([{ isIntersecting }]) => { seen = isIntersecting; }).observe(canvas);
       const stop = () => { turning = false; }, more = (seconds) => {
         turning &&= untouched();
         if (!turning) return app.off('update', more);
-        if (still()) return;
+        if (!seen || still()) return;
         const { yaw, ...rest } = lens.pose();
         lens.set({ ...rest, yaw: ((yaw + TURN * seconds + 180) % 360) - 180 });
         fitted = numbers(lens.pose());

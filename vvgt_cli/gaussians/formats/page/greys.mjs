@@ -36,9 +36,9 @@ export function greys(look, { values: [lo, hi], unit }, history) {
     key: 'window', state: () => now, set(then) { now = then; show(); },
     text: () => (written().join() === [...WHOLE, ...WHOLE].join() ? '' : written().join()),
     read(text) {
-      const found = (text || [...WHOLE, ...WHOLE].join()).split(',').map(Number);
-      if (found.length !== 4 || !(found[0] < found[1] && found[2] < found[3])) throw new Error('not a window');
-      return { 1: found.slice(0, 2), 2: found.slice(2) };
+      const ends = (text || [...WHOLE, ...WHOLE].join()).split(',').map(Number);
+      if (ends.length !== 4 || !(ends[0] < ends[1] && ends[2] < ends[3])) throw new Error('not a window');
+      return { 1: ends.slice(0, 2), 2: ends.slice(2) };
     },
   });
   return { root, draw(to) { kind = to; show(); }, ends: () => (now[kind] ?? WHOLE).map(of) };

@@ -12,13 +12,13 @@ const unit = (a) => { const length = Math.hypot(...a) || 1; return a.map((x) => 
 
 // where a plane meets a parallelepiped of eight corners: the corners of a polygon, and two directions in the plane
 export function sectionOf(ends, { normal, place }) {
-  const found = EDGES.flatMap(([i, j]) => {
+  const points = EDGES.flatMap(([i, j]) => {
     const [a, b] = [ends[i], ends[j]].map((p) => dot(normal, p) - place);
     return (a < 0) === (b < 0) ? [] : [plus(ends[i], plus(ends[j], ends[i], -1), a / (a - b))];
   });
   const side = unit(cross(normal, Math.abs(normal[0]) < 0.7 ? [1, 0, 0] : [0, 1, 0])), other = cross(normal, side);
-  const centre = found.reduce((sum, p) => plus(sum, p, 1 / found.length), [0, 0, 0]), angle = (p) => Math.atan2(dot(plus(p, centre, -1), other), dot(plus(p, centre, -1), side));
-  return { points: found.sort((p, q) => angle(p) - angle(q)), side, other };
+  const centre = points.reduce((sum, p) => plus(sum, p, 1 / points.length), [0, 0, 0]), angle = (p) => Math.atan2(dot(plus(p, centre, -1), other), dot(plus(p, centre, -1), side));
+  return { points: points.sort((p, q) => angle(p) - angle(q)), side, other };
 }
 
 export function handlesOf(lens, cut) {
@@ -43,8 +43,8 @@ export function handlesOf(lens, cut) {
     return (b * dot(d, w) - dot(u, w)) / Math.max(1 - b * b, 1e-6);
   }
   function line(p, u, x, y) {
-    const [px, py] = lens.project(p) ?? [x, y], d = unit(lens.ray(px, py).direction), found = { p, u, steep: 1 - dot(u, d) ** 2 < STEEP, from: y };
-    return { ...found, begun: along(found, x, y) };
+    const [px, py] = lens.project(p) ?? [x, y], d = unit(lens.ray(px, py).direction), axis = { p, u, steep: 1 - dot(u, d) ** 2 < STEEP, from: y };
+    return { ...axis, begun: along(axis, x, y) };
   }
 
   const face = (k, end) => {

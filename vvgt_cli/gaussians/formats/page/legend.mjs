@@ -10,9 +10,9 @@ const ROW = 18, LETTER = 7, MOST = 12;  // px of a label, of a letter of its nam
 
 // Round values between two
 export function ticks(lo, hi, many = 4) {
-  const step = round((hi - lo) / many) || 1, found = [];
-  for (let k = Math.ceil(lo / step - 1e-9); k * step <= hi + 1e-9 * step; k++) found.push(Number((k * step).toPrecision(12)));
-  return found;
+  const step = round((hi - lo) / many) || 1, values = [];
+  for (let k = Math.ceil(lo / step - 1e-9); k * step <= hi + 1e-9 * step; k++) values.push(Number((k * step).toPrecision(12)));
+  return values;
 }
 
 export function drawLegend(group, { nodes, live, right, bottom }) {

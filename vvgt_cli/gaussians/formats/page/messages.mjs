@@ -1,4 +1,4 @@
-// Messages between the page and the site that shows it in a frame (docs/live.md, "In a site").
+// Messages between the page and the site that shows it in a frame (docs/page.md, "In a site").
 import { dot } from './lens.mjs';
 import { functionFile } from './server.mjs';
 

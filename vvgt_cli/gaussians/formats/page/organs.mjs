@@ -20,7 +20,7 @@ function row({ name, number }, k) {
 export function organs(apply, labels, key, history) {
   const root = document.createElement('div');
   root.className = 'organs';
-  root.innerHTML = `<div><button class="undo" aria-label="undo" title="undo (Ctrl+Z)">↶</button><button class="redo" aria-label="redo" title="redo (Ctrl+Y, Ctrl+Shift+Z)">↷</button><input type="search" placeholder="search ${labels.length} labels" aria-label="search the labels"><button class="all" title="show all labels">all</button><button class="none" title="hide all labels">none</button></div><ul></ul>`;
+  root.innerHTML = `<div><button class="undo" aria-label="undo" title="undo (Ctrl+Z)">↶</button><button class="redo" aria-label="redo" title="redo (Ctrl+Y, Ctrl+Shift+Z)">↷</button><input type="search" placeholder="search labels" aria-label="search the labels"><button class="all" title="show all labels">all</button><button class="none" title="hide all labels">none</button></div><ul></ul>`;
   const find = (selector) => root.querySelector(selector), list = find('ul');
   find('[type=search]').hidden = labels.length <= SEARCHED;
   list.append(...labels.map(row));

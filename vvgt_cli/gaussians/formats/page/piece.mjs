@@ -74,11 +74,11 @@ export function piece(look, history) {
     root, part,
     get wants() { return wants; },
     take(place) {
-      const found = place && look.seedAt(place.place);
-      if (!found) return say('nothing there: click what stays');
+      const seed = place && look.seedAt(place.place);
+      if (!seed) return say('nothing there: click what stays');
       want(false);
       history.keep();
-      return set({ at: found.at, least: PART * found.tau });
+      return set({ at: seed.at, least: PART * seed.tau });
     },
   };
 }

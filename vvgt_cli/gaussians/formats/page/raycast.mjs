@@ -94,10 +94,10 @@ vec4 at${k}(vec3 p) {
   return s < -0.5${k ? ` || !within((m${k} * vec4(p, 1.0)).xyz)` : ''} ? vec4(0.0) : between(s, s, int(f${k}.z));
 }`}`)}
 vec2 empty(vec3 p, vec3 d, float best) {
-  vec2 found = vec2(1e9, 0.0), one;
+  vec2 span = vec2(1e9, 0.0), one;
 ${each((k) => `  one = empty${k}(p, d, best);
-  found = vec2(min(found.x, one.x), max(found.y, one.y));`)}
-  return found;
+  span = vec2(min(span.x, one.x), max(span.y, one.y));`)}
+  return span;
 }
 float kept(vec3 p) { return texture(piece, (m0 * vec4(p, 1.0)).xyz).r; }
 SAMPLE sampled(vec3 p) { return ${single ? 'value0(p)' : sum('at')}; }
@@ -234,9 +234,9 @@ export function raycaster(facts, gridsOf, { app }) {
   const place = (grid, index) => world().at(grid.toWorld(index)), index = (grid, p) => grid.toIndex(world().place(p));
   const edgesOf = (grid) => AXES.map((e) => minus(place(grid, e), place(grid, [0, 0, 0])));
   async function start() {
-    const mine = ++turn, found = await gridsFor();
+    const mine = ++turn, read = await gridsFor();
     if (mine !== turn) return;
-    grids = found;
+    grids = read;
     gl = canvas.getContext('webgl2', { alpha: false, antialias: false, preserveDrawingBuffer: true });
     if (!gl) throw new Error('it has no WebGL 2');
     if (gl.isContextLost()) throw new Error(LOST);
@@ -459,9 +459,9 @@ export function raycaster(facts, gridsOf, { app }) {
       [mask, chosen] = [null, now];
       if (now) {
         const grid = (grids = await gridsFor())[0], most = grid.bits === 8 ? 256 : 1 << 16, seen = Uint8Array.from({ length: most }, (_, code) => (tauOf(grid, code) >= now.least ? 1 : 0));
-        const found = await connected(grid, now.at[0] + grid.dims[0] * (now.at[1] + grid.dims[1] * now.at[2]), seen, () => new Promise((next) => { setTimeout(() => next(going())); }));
+        const body = await connected(grid, now.at[0] + grid.dims[0] * (now.at[1] + grid.dims[1] * now.at[2]), seen, () => new Promise((next) => { setTimeout(() => next(going())); }));
         if (!going()) return;
-        mask = found;
+        mask = body;
       }
       putMask();
     },
@@ -484,7 +484,7 @@ export function raycaster(facts, gridsOf, { app }) {
     // where half of what a ray meets is in front, of a MIP where its greatest value is; null: nothing
     async pick({ origin, direction }) {
       grids = await gridsFor();
-      const d = direction.map((x) => x / Math.hypot(...direction)), [o, r] = [index(grids[0], origin), minus(index(grids[0], plus(origin, d)), index(grids[0], origin))], found = [];
+      const d = direction.map((x) => x / Math.hypot(...direction)), [o, r] = [index(grids[0], origin), minus(index(grids[0], plus(origin, d)), index(grids[0], origin))], passed = [];
       const ends = o.map((x, c) => [(-0.5 - x) / r[c], (grids[0].dims[c] - 0.5 - x) / r[c]]), step = Math.min(...grids.flatMap(edgesOf).map((edge) => Math.hypot(...edge))) / 2;
       let [t, end] = [Math.max(...ends.map((some) => Math.min(...some)), 0), Math.min(...ends.map((some) => Math.max(...some)))], rest = 1;
       for (t += step / 2; t < end; t += step) {
@@ -492,10 +492,10 @@ export function raycaster(facts, gridsOf, { app }) {
         if (cutOff(p)) continue;
         const met = meets(p);
         if (kind !== 1) rest *= Math.exp(-met.reduce((sum, { tau }) => sum + tau, 0) * step);
-        found.push([p, kind === 1 ? met[0].value ?? -Infinity : rest]);
+        passed.push([p, kind === 1 ? met[0].value ?? -Infinity : rest]);
       }
-      if (kind === 1) return found.reduce((best, one) => (one[1] > best[1] ? one : best), [null, -Infinity])[0];
-      return 1 - rest < FAINT ? null : found.find(([, left]) => 1 - left >= (1 - rest) / 2)[0];
+      if (kind === 1) return passed.reduce((best, one) => (one[1] > best[1] ? one : best), [null, -Infinity])[0];
+      return 1 - rest < FAINT ? null : passed.find(([, left]) => 1 - left >= (1 - rest) / 2)[0];
     },
     // {value, in, layer, row} of the layer that is most at a place
     at(p) {

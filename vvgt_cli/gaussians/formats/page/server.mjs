@@ -9,16 +9,16 @@ const pause = (ms) => new Promise((done) => setTimeout(done, ms));
 // A page whose Gaussians are being made: what the server says until they are there.
 export async function waiting(said) {
   for (;;) {
-    let found;
+    let now;
     try {
-      found = await (await fetch('state')).json();
+      now = await (await fetch('state')).json();
     } catch {
       if (said.textContent === 'loading' || !said.dataset.failed) said.textContent = 'vvgt view has stopped';
       return;
     }
-    if (found.state !== 'first' && found.state !== 'failed') return location.reload();
-    said.textContent = found.said;
-    if (found.state === 'failed') said.dataset.failed = true;
+    if (now.state !== 'first' && now.state !== 'failed') return location.reload();
+    said.textContent = now.said;
+    if (now.state === 'failed') said.dataset.failed = true;
     await pause(ASK);
   }
 }
@@ -164,7 +164,7 @@ export function served(panel, viewer, server) {
     try {
       const answer = await send('save', { file, number, ...shown(), light: panel.lit() });
       if (!answer.ok) throw new Error(await reason(answer));
-      const link = file === 'html' && panel.begins?.(), at = (found) => `${found}"link": ${JSON.stringify(link).replaceAll('<', '\\u003c')}, `;
+      const link = file === 'html' && panel.begins?.(), at = (start) => `${start}"link": ${JSON.stringify(link).replaceAll('<', '\\u003c')}, `;
       download(link ? new Blob([(await answer.text()).replace('id="scene">{', at)], { type: 'text/html' }) : await answer.blob(), `${name}.${file}`);
     } catch (error) {
       say(error instanceof TypeError ? 'vvgt view has stopped' : error.message, true);

@@ -95,10 +95,10 @@ export function slicesOf(gridsOf, { world, cuts, rows, measures, moved, picked }
       scale, left, top, wide: scale * n * a, high: scale * m * b,
       pixel: (index) => [left + scale * a * (turned(along.sign, index[along.axis], n) + 0.5), top + scale * b * (turned(-up.sign, index[up.axis], m) + 0.5)],
       index(x, y) {
-        const found = [...at];
-        found[along.axis] = turned(along.sign, (x - left) / (scale * a) - 0.5, n);
-        found[up.axis] = turned(-up.sign, (y - top) / (scale * b) - 0.5, m);
-        return found;
+        const cell = [...at];
+        cell[along.axis] = turned(along.sign, (x - left) / (scale * a) - 0.5, n);
+        cell[up.axis] = turned(-up.sign, (y - top) / (scale * b) - 0.5, m);
+        return cell;
       },
     };
   }

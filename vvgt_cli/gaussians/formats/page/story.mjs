@@ -1,5 +1,5 @@
 // A story: steps, each a text with what is seen then, in the caption below the picture; shown by buttons, keys and swipes, written by the reader in a panel.
-// A step is {text} with the texts of a link, {link}, or with what a story.json states (docs/live.md): {camera, cut, function, labels, layer, light, slices, frame}.
+// A step is {text} with the texts of a link, {link}, or with what a story.json states (docs/page.md): {camera, cut, function, labels, layer, light, slices, frame}.
 import { listed } from './keys.mjs';
 import { partsOf, put, saidBy } from './link.mjs';
 import { save } from './saved.mjs';

@@ -235,6 +235,6 @@ export function where(viewer, scene, live, show, grids) {
   addEventListener('resize', spread);
   const free = stayFree(lens, scene, draw), { fit } = free;
   Object.defineProperty(state, 'clicked', { get: () => clicked });
-  Object.assign(state, { lens, marks, site, slices, story, restored: restore(parts, scene.link).then((found) => found || story.begin()), link: () => linkOf(parts), turn: () => free.turn(app, () => live?.look.shows), picture: drawing, get world() { return world; }, get facts() { return facts; } });
+  Object.assign(state, { lens, marks, site, slices, story, restored: restore(parts, scene.link).then((restored) => restored || story.begin()), link: () => linkOf(parts), turn: () => free.turn(app, () => live?.look.shows), picture: drawing, get world() { return world; }, get facts() { return facts; } });
   return state;
 }

@@ -7,26 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.errors import DataError
 from vvgt_cli.look.function import BY, PER_VOXEL, ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.isosurfaces import Isosurfaces
 from vvgt_cli.look.lighting import COEFFICIENTS
-
-
-def placed(tf: TransferFunction, limits: tuple[float, float] | None) -> TransferFunction:
-    """Return the function on data values, stretched to ``limits``; raise UsageError where they do not suit it."""
-    if tf.domain in BY:
-        if limits is not None:
-            raise UsageError(f"{tf.name}: its nodes are {BY[tf.domain]} of the data; omit --tf-range")
-        return tf
-    if tf.domain == "fraction":
-        if limits is None:
-            raise UsageError(
-                f"{tf.name}: its nodes are fractions of the range of the data; give that range as --tf-range LO,HI"
-            )
-        share = tf.breakpoints()
-        return tf.moved(limits[0] * (1 - share) + limits[1] * share)
-    return tf if limits is None else tf.rescaled(*limits)
 
 
 def to_text(tf: TransferFunction, form: str) -> str:
