@@ -134,8 +134,9 @@ class Verdict:
             return f"does not hold: {'; '.join(self.failures())}"
         volume = "the volume was not compared (too large)" if self.same_volume is None else "the same volume"
         text = f"holds: {volume} and look, {self.psnr:.2f} dB ({self.recorded:.2f} dB recorded)"
-        values = f", values {self.values_psnr:.2f} dB ({self.values_recorded:.2f})"
-        return text if self.values_recorded is None else text + values
+        if self.values_recorded is None:
+            return text
+        return f"{text}, values {self.values_psnr:.2f} dB ({self.values_recorded:.2f})"
 
 
 def verify(

@@ -14,7 +14,6 @@ from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.header import FileFacts
 from vvgt_cli.gaussians.live_facts import LABEL_ROW, LAYER_ID, LiveFacts
 from vvgt_cli.gaussians.opacity import dilogarithm, projected_areas
-from vvgt_cli.gaussians.ply import opacity
 from vvgt_cli.look.recognise import background_bins
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.blocks import check_memory
@@ -187,7 +186,7 @@ def density_planes(header: FileFacts, gaussians: Gaussians, grid: Volume) -> Pla
     place = place_of(header)
     bells = Bells.of(gaussians, np.linalg.inv(place) @ grid.affine)
     areas = projected_areas(np.exp(2 * gaussians.log_scales.astype(np.float64)), 0.0).mean(axis=1)
-    mass = dilogarithm(opacity(gaussians).astype(np.float64)) * areas * place[0, 0] ** 2
+    mass = dilogarithm(gaussians.opacity.astype(np.float64)) * areas * place[0, 0] ** 2
     volume = np.linalg.det(bells.widened(DENSE_SOFT)) * abs(np.linalg.det(grid.affine[:3, :3]))
     peak = mass / ((2 * math.pi) ** 1.5 * volume)
     fields = np.concatenate([np.ones((len(peak), 1)), gaussians.colors.clip(0, None)], axis=1) * peak[:, None]
