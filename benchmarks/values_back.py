@@ -46,6 +46,9 @@ def sz3(values: np.ndarray, tolerance: float) -> tuple[int, np.ndarray]:
     return packed.nbytes, pysz.sz.decompress(packed, values.dtype, values.shape)[0]
 
 
+CODECS = {"zfp": zfp, "sz3": sz3}
+
+
 def at_most(codec: Callable, values: np.ndarray, good: Callable[[int, np.ndarray], bool], span: float, fine: bool):
     """Bytes and dB at the coarsest (``fine``: the finest) tolerance, by bisection, that is ``good``."""
     low, high, found = -7.0, 0.0, None  # powers of ten, shares of the range
@@ -78,7 +81,7 @@ def measured(name: str, field: Resident, count: int) -> dict[str, object]:
         "psnr_covered": psnr(wrong[found != np.float32(planes.background)], span),
         "largest_%": float(100 * np.abs(wrong).max() / span),
     }  # fmt: skip
-    for title, codec in {"zfp": zfp, "sz3": sz3}.items():
+    for title, codec in CODECS.items():
         equal = at_most(codec, values, lambda n, _: n <= size, span, True)
         same = at_most(codec, values, lambda _, back: psnr(back - values, span) >= ours, span, False)
         row |= {f"{title}_at_equal_MB": equal[1], f"{title}_MB_at_equal_dB": same[0] / 1e6}
