@@ -17,6 +17,7 @@ import shlex
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import click
@@ -35,11 +36,11 @@ FIELDS = ["psnr", "psnr_foreground", "psnr_white", "psnr_alpha", "ssim", "psnr_2
 SECONDS = ["closed_form_s", "views_s", "back_projection_s"]
 
 
-def scene_rows(listing: str | Path) -> list[list[str]]:
-    """Scene, volume, options and function of each line of a list, without comments and the names of the columns."""
+def scene_rows(listing: str | Path, only: Sequence[str] = ()) -> list[list[str]]:
+    """Scene, volume, options and function of each line of a list, or of ``only`` some scenes."""
     lines = [line for line in Path(listing).read_text("utf-8").splitlines() if line.strip() and line[0] != "#"]
     rows = [[word.strip() for word in line.split("\t")[:4]] for line in lines]
-    return [row for row in rows if row[0] != "scene"]
+    return [row for row in rows if row[0] != "scene" and (not only or row[0] in only)]
 
 
 def read_options(text: str) -> ReadOptions:
@@ -110,9 +111,7 @@ def main(paths, output, stored, only, method, max_gaussians, step):
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
     machine = f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
     rows = []
-    for name, volume, options, function in scene_rows(scenes):
-        if only and name not in only:
-            continue
+    for name, volume, options, function in scene_rows(scenes, only):
         for how in method:
             request = SourceRequest(
                 volume=str(data / volume),

@@ -62,9 +62,7 @@ def main(
     folder.mkdir(parents=True, exist_ok=True)
     listing, data, functions = map(Path, paths)
     rows = []
-    for name, volume, options, function in scene_rows(listing):
-        if names and name not in names:
-            continue
+    for name, volume, options, function in scene_rows(listing, names):
         file, page = folder / f"{name}.ply", folder / f"{name}.html"
         source = (data / volume, *shlex.split(options), "--tf", functions / function)
         made = ("--opacity-unit-distance", "mean-spacing", "--live", "--max-gaussians", gaussians)

@@ -134,9 +134,7 @@ def main(
     folder.mkdir(parents=True, exist_ok=True)
     listing, data, functions = map(Path, paths)
     rows, opened, person = [], "", None
-    for name, volume, options, function in scene_rows(listing):
-        if names and name not in names:
-            continue
+    for name, volume, options, function in scene_rows(listing, names):
         file = volume if volume.startswith("example:") else str(data / volume)
         reading, begun = reading_and_look(options, data)
         page = folder / f"{name}.html"

@@ -1,6 +1,5 @@
 """The page of `vvgt view`, and the one in a file, in a real browser that reaches nothing but its own address."""
 
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -99,24 +98,6 @@ def test_a_page_of_several_in_a_file_goes_to_each(file: Path, tmp_path: Path) ->
         assert psnr(picture, shot) > 36
 
 
-LOOK: dict[str, Any] = {
-    "name": "w",
-    "points": [
-        {"x": 8, "rgb": [1, 0.2, 0.1], "opacity": 0}, {"x": 14, "rgb": [0.2, 1, 0.3], "opacity": 0.3},
-        {"x": 22, "rgb": [0.9, 0.9, 1], "opacity": 0.02}, {"x": 29, "rgb": [0.3, 0.3, 1], "opacity": 0.6},
-    ],
-}  # fmt: skip
-DRAG = """(() => {
-  document.querySelector('#live.folded .fold')?.click();
-  const svg = document.querySelector('#live svg'), node = svg.querySelectorAll('.node')[1].getBoundingClientRect();
-  const at = { clientX: node.x + node.width / 2, clientY: node.y + node.height / 2, bubbles: true, pointerId: 1 };
-  svg.setPointerCapture = () => {};
-  const fire = (name, y) => svg.dispatchEvent(new PointerEvent(name, { ...at, clientY: y }));
-  const low = svg.getBoundingClientRect().bottom - 4;
-  fire('pointerdown', at.clientY); fire('pointermove', low); fire('pointerup', low);
-})()"""
-
-
 @pytest.fixture(scope="module")
 def live(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A live file and its page beside it."""
@@ -124,46 +105,6 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert run(["convert", "example:frog", "--live", "--max-gaussians", "20000", "--quiet", "-o", str(path)]) == 0
     assert run(["view", str(path), "-o", str(path.with_suffix(".html")), "--quiet"]) == 0
     return path
-
-
-def applied(points: list[dict[str, Any]]) -> str:
-    nodes = [{"x": point["x"], "y": point["opacity"], "rgb": point["rgb"]} for point in points]
-    return f"window.vvgt.live.set({json.dumps(nodes)})"
-
-
-def test_a_live_page_shows_a_function_as_recolor_does_until_a_node_is_dragged(live: Path, tmp_path: Path) -> None:
-    (tmp_path / "w.json").write_text(json.dumps(LOOK))
-    out = tmp_path / "w.ply"
-    assert run(["recolor", str(live), "--tf", str(tmp_path / "w.json"), "--quiet", "-o", str(out)]) == 0
-    url = live.with_suffix(".html").as_uri()
-    shot, _ = shoot(url, tmp_path, before=applied(LOOK["points"]))
-    same = psnr(ours(out), shot)
-    print(f"the page of a live file under another function against our drawing: {same:.2f} dB")
-    baked, _ = shoot(url, tmp_path)
-    assert same > max(35, psnr(ours(out), baked) + 10)
-    dragged, _ = shoot(url, tmp_path, before=f"{applied(LOOK['points'])}; {DRAG}")
-    hidden = [{**point, "opacity": 0 if k == 1 else point["opacity"]} for k, point in enumerate(LOOK["points"])]
-    wanted, _ = shoot(url, tmp_path, before=applied(hidden))
-    assert psnr(wanted, dragged) > psnr(shot, dragged) + 10
-    undo = "document.querySelector('#live .undo').click()"
-    undone, _ = shoot(url, tmp_path, before=f"{applied(LOOK['points'])}; {DRAG}; {undo}")
-    assert psnr(undone, shot) > 45
-
-
-def test_a_live_page_is_cut(live: Path, tmp_path: Path) -> None:
-    """At half of the range along x: a part stays, and its other side is the rest."""
-    url = live.with_suffix(".html").as_uri()
-    whole, _ = shoot(url, tmp_path)
-    choose = "(() => {"
-    choose += "const axis = document.querySelector('#live .axis'); axis.selectedIndex = 1;"
-    choose += "axis.dispatchEvent(new Event('change')); })()"
-    half, _ = shoot(url, tmp_path, before=choose)
-    other, _ = shoot(url, tmp_path, before=f"{choose}; document.querySelector('#live .flip').click()")
-    lit = [float((picture.max(axis=-1) > 0.1).mean()) for picture in (whole, half, other)]
-    print("lit shares: whole, either half:", lit)
-    assert min(lit[1:]) > 0.25 * lit[0]
-    assert max(lit[1:]) < 0.75 * lit[0]
-    assert lit[1] + lit[2] > 0.95 * lit[0]  # the view is oblique: both may cover a pixel
 
 
 def test_the_page_of_a_volume_shows_its_conversion_until_the_function_is_changed(tmp_path: Path) -> None:

@@ -315,7 +315,7 @@ def test_medical_files_are_not_for_diagnosis(pages: dict[str, str], person: Pers
 def test_a_sandboxed_frame_tells_its_story(pages: dict[str, str], person: Person, tmp_path: Path) -> None:
     """Without an origin; a picture that the frame may not save says so."""
     source = f'<iframe src="{pages["bare"]}" sandbox="allow-scripts" style="width:100%;height:90vh"></iframe>'
-    (tmp_path / "site.html").write_text(f"<!doctype html>{source}")
+    (tmp_path / "site.html").write_text(f"<!doctype html><meta name=viewport content=width=device-width>{source}")
     forbidden, offered = "not allowed to copy pictures", "document.querySelector('#saved')?.innerText"
     frame: Any = person("framed", (tmp_path / "site.html").as_uri(), [
         ["eval", "window.vvgt.where.story.show(1)"], ["eval", SAID], ["click", "#tools .picture"],

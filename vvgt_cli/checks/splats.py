@@ -72,13 +72,11 @@ def value_cases(gaussians: Gaussians, edge: float | None, size: int) -> Iterator
         pixels = largest / (length / 2) * size / (2 * np.tan(np.radians(20)) * EYE_RADIUS)
         return Figure("share of the opacity", share(pixels < 0.25), 0.5)
 
-    def gaudy() -> Figure:
-        return Figure("share of the opacity", share(np.abs(gaussians.colors - 0.5).max(axis=1) > 1.0), 0.01)
-
     yield Case("values", "largest sigma", lambda: Figure("of the longest edge", float(largest.max() / length), 1.0))
     yield Case("values", f"sigma below a quarter of a pixel at {size} px", tiny)
     yield Case("values", "too faint for viewers to draw", faint)
-    yield Case("values", "colours outside -0.5 to 1.5", gaudy)
+    gaudy = np.abs(gaussians.colors - 0.5).max(axis=1) > 1.0
+    yield Case("values", "colours outside -0.5 to 1.5", lambda: Figure("share of the opacity", share(gaudy), 0.01))
 
 
 def place_cases(

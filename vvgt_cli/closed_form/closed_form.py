@@ -16,16 +16,7 @@ from vvgt_cli.closed_form.pyramid import Pyramid, Tile
 from vvgt_cli.closed_form.samples import visible_voxels
 from vvgt_cli.closed_form.shape import ROUND, STYLES, SurfaceStyle
 from vvgt_cli.closed_form.surface_offset import opaque_field
-from vvgt_cli.closed_form.tree import (
-    Leaves,
-    Scores,
-    Tree,
-    leaves_of,
-    select,
-    split,
-    split_score,
-    value_score,
-)
+from vvgt_cli.closed_form.tree import Leaves, Scores, Tree, leaves_of, select, split, split_score, value_score
 from vvgt_cli.closed_form.visibility import visibility
 from vvgt_cli.dvr import BoxFrame, Scene
 from vvgt_cli.gaussians import INRIA, Gaussians, Rule

@@ -62,10 +62,7 @@ def morton(index: np.ndarray) -> np.ndarray:
 
 
 def base_cells(
-    scene: Scene,
-    exponent: np.ndarray,
-    points_per_voxel: int = POINTS,
-    progress: Callable[[float], None] | None = None,
+    scene: Scene, exponent: np.ndarray, points_per_voxel: int = POINTS, progress: Callable[[float], None] | None = None
 ) -> Cells:
     """Integrate the moments of every base cell with extinction (see `Cells`) in a fixed scratch beside the result.
 

@@ -36,13 +36,7 @@ def between(p: float, d: float, n: int) -> Between:
 
 @_jit
 def _rows(
-    values: np.ndarray,
-    y: Between,
-    z: Between,
-    first: int,
-    value: np.ndarray,
-    along_y: np.ndarray,
-    along_z: np.ndarray,
+    values: np.ndarray, y: Between, z: Between, first: int, value: np.ndarray, along_y: np.ndarray, along_z: np.ndarray
 ) -> tuple[float, float, float]:
     """Write voxels from ``first`` on, between rows: ``value``, and its differences over a point's box along y and z.
 

@@ -19,7 +19,7 @@ from vvgt_cli.conversion.stages.views import suits_small_views
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.blocked import Blocked
 from vvgt_cli.field.field import Field, Picture
-from vvgt_cli.field.workload import expected_wide
+from vvgt_cli.field.workload import view_edge
 from vvgt_cli.files import check_disk_space
 from vvgt_cli.gaussians import Gaussians, as_stored
 from vvgt_cli.gaussians.formats import format_of
@@ -140,9 +140,11 @@ def _planned(work: Work, request: ConvertRequest) -> tuple[Planner, Plan]:
     """Return planner and plan before the first stage."""
     fit = work.fit
     workload = replace(work.field.workload(fit.screen, fit.max_gaussians), degree=work.degree)
+    # a guess: there are fewer than pixels in a view twice as large as a small one
+    wide = fit.max_gaussians <= (2 * view_edge(fit.screen, small=True)) ** 2
     planner = Planner(
         request.limits, fit, sh_degree=request.ply.sh_degree or work.degree,
-        wide=expected_wide(fit.max_gaussians, fit.screen), whole=request.scored_whole, writes=request.writes,
+        wide=wide, whole=request.scored_whole, writes=request.writes,
         axes=headset_axes(work.field.source.volume, work.ply.up), parts=_parts(work, request),
     )  # fmt: skip
     plan = planner.plan(workload, work.run.elapsed())

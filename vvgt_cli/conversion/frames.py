@@ -141,7 +141,8 @@ class FrameSeries(Batch):
             if source.labels is None and surveyed.labels is not None:
                 source = replace(source, labels=AUTO)
             shown, distance = _functions(source, surveyed)
-            self._dark = [not source.layers and _invisible(shown, ranges) for ranges in surveyed.ranges]
+            seen = [any(tf.support(*span) for tf, span in zip(shown, spans, strict=True)) for spans in surveyed.ranges]
+            self._dark = [not (source.layers or one) for one in seen]
             lo, hi = min(n.lo for n in surveyed.whole), max(n.hi for n in surveyed.whole)
             stage.note = (
                 f"{len(steps)} of {' x '.join(map(str, surveyed.grid.dims))}, values {lo:g} to {hi:g}; "
@@ -240,7 +241,9 @@ def survey(
         content = open_content(step.volume, replace(step.read, stored=True, packed=True) if stored else step.read)
         if content.overlapping:
             raise UsageError(f"{step.name}: its segments overlap; convert such frames one by one")
-        first = first or replace(content, volumes=tuple(map(_without_values, content.volumes)))
+        if first is None:  # with zeros that take no memory as its values
+            blank = [replace(v, data=np.broadcast_to(v.data.dtype.type(0), v.data.shape)) for v in content.volumes]
+            first = replace(content, volumes=tuple(blank))
         _check_frame(step, steps[0], content, first)
         if k == 0 and labels is None and tf is None and content.single_volume:
             mapped = recognised(content.volumes[0])
@@ -255,11 +258,6 @@ def survey(
     whole = tuple(merge_statistics(rows) for rows in zip(*stats, strict=True))
     own = [[(n.lo, n.hi) for n in rows] for rows in stats]
     return Survey(len(steps), own, whole, first, digest(*digests), tuple(sorted(present)) if mapped else None)
-
-
-def _without_values(volume: Volume) -> Volume:
-    """Return the volume with zeros that take no memory as its values."""
-    return replace(volume, data=np.broadcast_to(volume.data.dtype.type(0), volume.data.shape))
 
 
 def _check_frame(step: Step, begin: Step, content: OpenedFile, first: OpenedFile) -> None:
@@ -286,11 +284,6 @@ def merge_statistics(volumes: Sequence[Statistics]) -> Statistics:
     below[0], below[-1] = 0, sum(int(p.histogram.sum()) for p in volumes)
     histogram = np.diff(np.round(below)).astype(np.int64)
     return Statistics(lo, hi, sum(p.nan_count for p in volumes), sum(p.inf_count for p in volumes), histogram, edges)
-
-
-def _invisible(shown: Sequence[TransferFunction | LabelTable], ranges: Sequence[tuple[float, float]]) -> bool:
-    """Return whether nothing of a frame is visible."""
-    return not any(tf.support(*limits) for tf, limits in zip(shown, ranges, strict=True))
 
 
 def _functions(

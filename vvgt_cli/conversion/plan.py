@@ -149,11 +149,6 @@ class Planner:
     axes: Axes = UPRIGHT
     parts: OutOfCore | None = None
 
-    @property
-    def by_moments(self) -> bool:
-        """Return whether the closed form has a pyramid of cells, which can be cut again."""
-        return self.fit.init == "moments"
-
     def plan(self, workload: Workload, spent: float, begun: bool = False) -> Plan:
         """Return the stages that fit after ``spent`` seconds; with ``begun`` the closed form is done."""
         count = self.fit.max_gaussians
@@ -201,7 +196,7 @@ class Planner:
 
     def _descent(self, steps: int, small: bool, most: int) -> list[Stage]:
         """Return gradient descent with its views, and cells by error unless steps are few or a network runs."""
-        enough = steps >= ENOUGH_STEPS and self.by_moments
+        enough = steps >= ENOUGH_STEPS and self.fit.init == "moments"  # else no pyramid can be cut again
         return [
             CheckViews(),
             TrainingViews(view_count(steps, small), view_edge(self.fit.screen, small)),

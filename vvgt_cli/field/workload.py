@@ -85,11 +85,6 @@ def view_edge(size: int, small: bool) -> int:
     return min(size // 2, SMALL) if small else min(size, LARGE)
 
 
-def expected_wide(gaussians: int, size: int) -> bool:
-    """Guess whether Gaussians will be wide: there are fewer than pixels in a view twice as large as a small one."""
-    return gaussians <= (2 * view_edge(size, small=True)) ** 2
-
-
 def measure(scene: Scene, size: int, gaussians: int) -> Workload:
     """Measure a scene's workload: count it, time a small view, and time a picture of Gaussians for the pace."""
     from vvgt_cli.closed_form.samples import visible_voxels

@@ -29,7 +29,9 @@ def property_json(prop: Any, component: int = 0, scale: float = 1.0) -> Found:
     """
     notes: list[str] = []
     if prop.GetColorChannels(component) == 1:
-        colors = {"grayTransferFunction": _gray(prop.GetGrayTransferFunction(component))}
+        grays = _nodes(prop.GetGrayTransferFunction(component), 4)
+        points = [_point(x, *bend, y=min(max(y, 0.0), 1.0)) for x, y, *bend in grays]
+        colors = {"grayTransferFunction": {"points": points}}
     else:
         colors = {"rgbTransferFunction": _colors(prop.GetRGBTransferFunction(component), notes)}
     opacity = _opacity(prop.GetScalarOpacity(component), prop.GetComponentWeight(component), notes)
@@ -79,10 +81,6 @@ def _beyond(nodes: list[list[float]], below: list[float] | None, above: list[flo
 
 def _point(x: float, middle: float, sharpness: float, **value: Any) -> dict[str, Any]:
     return {"x": x, **value, "midpoint": middle, "sharpness": sharpness}
-
-
-def _gray(function: Any) -> dict[str, Any]:
-    return {"points": [_point(x, *bend, y=min(max(y, 0.0), 1.0)) for x, y, *bend in _nodes(function, 4)]}
 
 
 def _colors(function: Any, notes: list[str]) -> dict[str, Any]:

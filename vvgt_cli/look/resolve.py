@@ -32,10 +32,7 @@ def parse_tf_range(spec: str | tuple[float, float]) -> str | tuple[float, float]
 
 
 def resolve(
-    tf: TransferFunction,
-    statistics: Statistics,
-    tf_range: str | tuple[float, float] = "data",
-    hounsfield: bool = False,
+    tf: TransferFunction, statistics: Statistics, tf_range: str | tuple[float, float] = "data", hounsfield: bool = False
 ) -> TransferFunction:
     """Return the function with its nodes on data values.
 

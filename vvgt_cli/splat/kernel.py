@@ -95,9 +95,7 @@ def _opacity(logits: np.ndarray, k: int) -> float:
     return opacity
 
 
-@parallel_kernel(
-    "f4:2 f4:2 f4:2 f4:1 f8:2 f8:1 f8:1 f8:1 f4:2 f4:1 i4:2",
-)
+@parallel_kernel("f4:2 f4:2 f4:2 f4:1 f8:2 f8:1 f8:1 f8:1 f4:2 f4:1 i4:2")
 def project(
     thread: ThreadSlice, means: np.ndarray, log_scales: np.ndarray, quats: np.ndarray, logits: np.ndarray,
     rot: np.ndarray, trans: np.ndarray, lens: np.ndarray, rule: np.ndarray, flat: np.ndarray,
@@ -120,9 +118,7 @@ def project(
         _finish(buf, begin, count, pose, lens, rule, flat, depth, extent)
 
 
-@parallel_kernel(
-    "f4:2 f4:3 f4:1 f8:2 f8:1 f8:1 f8:1 f4:2 f4:1 i4:2",
-)
+@parallel_kernel("f4:2 f4:3 f4:1 f8:2 f8:1 f8:1 f8:1 f4:2 f4:1 i4:2")
 def project_factors(
     thread: ThreadSlice,
     means: np.ndarray, factors: np.ndarray, logits: np.ndarray, rot: np.ndarray, trans: np.ndarray, lens: np.ndarray,

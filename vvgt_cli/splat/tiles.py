@@ -86,11 +86,7 @@ def _blend_tile(
                     buf[j + PLANE_3] += weight * blue
 
 
-@parallel_kernel(
-    "i8:1 i8:1 i4:1 i4:2 f4:2 f4:2 i8 f4:1 f4:3",
-    fastmath=True,
-    error_model="numpy",
-)
+@parallel_kernel("i8:1 i8:1 i4:1 i4:2 f4:2 f4:2 i8 f4:1 f4:3", fastmath=True, error_model="numpy")
 def blend(
     thread: ThreadSlice,
     tiles: np.ndarray, start: np.ndarray, members: np.ndarray, extent: np.ndarray, flat: np.ndarray, colors: np.ndarray,
@@ -150,11 +146,7 @@ def _gather_tile(
             pairs[slot, 0], pairs[slot, 1], pairs[slot, 2], pairs[slot, 3], pairs[slot, 4] = s0, s1, s2, s3, s4
 
 
-@parallel_kernel(
-    "i8:1 i8:1 i4:1 i8:1 i4:2 f4:2 i8 f4:1 f4:3 f4:2",
-    fastmath=True,
-    error_model="numpy",
-)
+@parallel_kernel("i8:1 i8:1 i4:1 i8:1 i4:2 f4:2 i8 f4:1 f4:3 f4:2", fastmath=True, error_model="numpy")
 def gather(
     thread: ThreadSlice,
     tiles: np.ndarray, start: np.ndarray, members: np.ndarray, slots: np.ndarray, extent: np.ndarray, flat: np.ndarray,
