@@ -59,6 +59,7 @@ TABLES = [
     ("damaged", {"ROWS": 5}, f"blob.ply --volume blob.nrrd {' '.join(LOOK)} -o a.csv", None, None),
     ("training", {}, "gain SCENES -o a.csv --gaussians 40 --ways network --model vvgt-small --cache cache", "psnr", 10),
     ("training", SMALL, "data data", None, None),
+    ("values_back", {"CODECS": {}}, "SCENES -o a.csv --gaussians 200", "psnr", 15),
 ]  # fmt: skip
 PRINTED = [  # (program, constants, words, what it prints)
     ("dvr", {"SIZE": SIZE, "REPEATS": 1, "SETTINGS": {"one": RenderSettings(samples=1)}}, "ns/sample"),

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from vvgt_cli.commands.session import Session, read_ply, read_volume
     from vvgt_cli.commands.synth import synth
     from vvgt_cli.commands.view import view
+    from vvgt_cli.commands.voxelize import voxelize
     from vvgt_cli.conversion.clouds import Clouds
     from vvgt_cli.conversion.result import Conversion, Result
     from vvgt_cli.errors import DataError, UsageError, VvgtError
@@ -57,7 +58,10 @@ _WHERE = {  # imported on first use, so that `import vvgt_cli` costs nothing
     "look.lighting": ("LightOptions",),
     "volume": ("Volume",),
     **{f"commands.{name}": (name,) for name in ("check", "convert", "evaluate", "infer", "info", "init", "optimize")},
-    **{f"commands.{name}": (name,) for name in ("recolor", "render", "render_views", "report", "synth", "view")},
+    **{
+        f"commands.{name}": (name,)
+        for name in ("recolor", "render", "render_views", "report", "synth", "view", "voxelize")
+    },
 }
 _MODULES = {name: module for module, names in _WHERE.items() for name in names}
 
@@ -97,6 +101,7 @@ __all__ = [
     "report",
     "synth",
     "view",
+    "voxelize",
 ]
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import SIZE
-from vvgt_cli.conversion.certify import verify
+from vvgt_cli.conversion.certify import rounded_error, verify
 from vvgt_cli.conversion.gaussian_files import STDIN, file_rule, layout_of, levels_in_box, open_gaussians
 from vvgt_cli.conversion.place import headset_axes, to_box_frame, upright_axes
 from vvgt_cli.conversion.place import preview as side_by_side
@@ -190,9 +190,8 @@ def score(
             inside = levels_in_box(place[0], volume)
         for remark in _doubts(header, field.source):
             run.console.message(f"{ply}: {remark}")
-        evaluation = _scored(
-            run, field, len(gaussians), inside, header, drawn, tf_record(field.source, request), size, step
-        )
+        function = tf_record(field.source, request)
+        evaluation = _scored(run, field, gaussians, inside, header, drawn, function, size, step)
         if preview is not None:
             camera, axes = default_views("test", size=size)[PICTURED], upright_axes(volume, header.up)
             with run.stage("preview"):
@@ -219,12 +218,12 @@ def _doubts(header: PlyHeader, source: StyledVolume) -> Iterator[str]:
 
 
 def _scored(
-    run: Run, volume: Field, count: int, gaussians: Shown, header: PlyHeader, rule: Rule, function: dict[str, Any],
-    size: int, step: float,
+    run: Run, volume: Field, carried: Gaussians, gaussians: Shown, header: PlyHeader, rule: Rule,
+    function: dict[str, Any], size: int, step: float,
 ) -> Evaluation:  # fmt: skip
-    """Score ``count`` Gaussians (box frame) on the test views, and check their certificate.
+    """Score Gaussians (box frame) on the test views, and check their certificate.
 
-    ``function`` is the record of the volume's.
+    ``carried`` are those of the file, unit frame; ``function`` is the record of the volume's.
     """
     from vvgt_cli.dvr import REFERENCE
 
@@ -232,7 +231,7 @@ def _scored(
         own = _reference_psnr(volume, size, step)
         stage.note = f"its own error {own:.1f} dB"
     views, record = len(default_views("test")), volume_record(volume.source)
-    evaluation = Evaluation(count, size, rule.name, step, views, record, function, own)
+    evaluation = Evaluation(len(carried), size, rule.name, step, views, record, function, own)
     settings = replace(REFERENCE, step=step)
     wanted = [Picture(camera, settings, part) for _, camera, part in scored_views(size, perceptual=True)]
     with run.stage("test views") as stage, _together(volume, wanted):
@@ -243,7 +242,8 @@ def _scored(
     if header.certificate is not None:
         looked_up = header.live is not None and isinstance(gaussians, Gaussians) and gaussians.live is None
         with run.stage("certificate") as stage:
-            verdict = verify(header.certificate, volume, gaussians, looked_up)
+            values = rounded_error(header, carried, volume)[0] if header.certificate.values_psnr else None
+            verdict = verify(header.certificate, volume, gaussians, looked_up, values)
             evaluation.certificate = asdict(verdict) | {"holds": verdict.holds, "text": verdict.text()}
             stage.note = verdict.text()
     return evaluation

@@ -24,7 +24,19 @@ from vvgt_cli.resources import keep_freed_memory, return_freed_memory
 from vvgt_cli.version import VERSION
 
 COMMANDS = [  # modules of this subpackage, with underscores
-    *("convert", "init", "merge", "optimize", "recolor", "view", "render", "render-views", "evaluate", "check"),
+    *(
+        "convert",
+        "init",
+        "merge",
+        "optimize",
+        "recolor",
+        "view",
+        "render",
+        "render-views",
+        "voxelize",
+        "evaluate",
+        "check",
+    ),
     *("report", "info", "tf", "infer", "export", "train", "synth", "plugin", "warmup"),
 ]
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it

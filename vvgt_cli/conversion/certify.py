@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.conversion.request import FitOptions
+from vvgt_cli.conversion.voxelize import values_error
+from vvgt_cli.field.digests import LARGEST
 from vvgt_cli.field.field import Field
 from vvgt_cli.gaussians import Gaussians, PlyOptions
-from vvgt_cli.gaussians.header import Certificate
+from vvgt_cli.gaussians.header import Certificate, FileFacts
 from vvgt_cli.score.record import Run
 from vvgt_cli.score.viewing import PREVIEW_VIEWS, ViewingCondition
 from vvgt_cli.score.views import score_test_views, test_view_pixels
@@ -38,6 +40,7 @@ def with_certificate(
     scores, conditions = run.report.scores, [ViewingCondition(**condition) for condition in run.report.conditions or ()]
     if not ply.comments or scores is None:
         return ply
+    values = rounded_error(ply, gaussians, field)
     found = Certificate(
         volume=ply.title or field.source.title,
         sha256=field.digest(),
@@ -51,9 +54,20 @@ def with_certificate(
         conditions=tuple((condition.name(), round(condition.psnr, 2)) for condition in conditions),
         texture=_rounded_texture(run.report.texture),
         position_error=position_error(gaussians, ply),
+        values_psnr=values[0],
+        values_error=values[1],
         command=command,
     )
     return replace(ply, certificate=found)
+
+
+def rounded_error(ply: FileFacts, gaussians: Gaussians, field: Field) -> tuple[float | None, float | None]:
+    """Return `values_error` of live Gaussians (unit frame) as certificates have it; Nones where there is none."""
+    volume = field.source.volume
+    if volume.data.nbytes > LARGEST:
+        return None, None
+    psnr, largest = values_error(ply, gaussians, volume) or (None, None)
+    return psnr and round(psnr, 2), largest and float(f"{largest:.4g}")
 
 
 def _rounded_texture(found: dict[str, Any] | None) -> tuple[float, float] | None:
@@ -87,12 +101,15 @@ class Verdict:
         same_look: whether functions, tables, distances and light are those of the certificate.
         psnr: dB of the same views, now.
         recorded: dB in the certificate.
+        values_psnr, values_recorded: dB of live values on the volume's grid, now and recorded; None without.
     """
 
     same_volume: bool | None
     same_look: bool
     psnr: float
     recorded: float
+    values_psnr: float | None = None
+    values_recorded: float | None = None
 
     @property
     def holds(self) -> bool:
@@ -107,16 +124,24 @@ class Verdict:
             yield "made under another function, other labels, opacity distances or light"
         if not self.psnr >= self.recorded - WITHIN:
             yield f"{self.psnr:.2f} dB, {self.recorded:.2f} dB recorded"
+        now, before = self.values_psnr, self.values_recorded
+        if before is not None and not (now is not None and now >= before - WITHIN):
+            yield f"values {'none' if now is None else f'{now:.2f} dB'}, {before:.2f} dB recorded"
 
     def text(self) -> str:
         """Return the verdict as one line."""
         if not self.holds:
             return f"does not hold: {'; '.join(self.failures())}"
         volume = "the volume was not compared (too large)" if self.same_volume is None else "the same volume"
-        return f"holds: {volume} and look, {self.psnr:.2f} dB ({self.recorded:.2f} dB recorded)"
+        text = f"holds: {volume} and look, {self.psnr:.2f} dB ({self.recorded:.2f} dB recorded)"
+        if self.values_recorded is None:
+            return text
+        return f"{text}, values {self.values_psnr:.2f} dB ({self.values_recorded:.2f})"
 
 
-def verify(certificate: Certificate, field: Field, gaussians: Shown, looked_up: bool = False) -> Verdict:
+def verify(
+    certificate: Certificate, field: Field, gaussians: Shown, looked_up: bool = False, values: float | None = None
+) -> Verdict:
     """Verify a certificate against the volume: compare digests, and score its views again.
 
     Args:
@@ -124,6 +149,7 @@ def verify(certificate: Certificate, field: Field, gaussians: Shown, looked_up: 
         field: the volume under its look.
         gaussians: Gaussians of the file, box frame, or what is shown of its levels to a camera.
         looked_up: the Gaussians of a live file are as `vvgt recolor` shows them, not as stored.
+        values: dB of a live file's values on the volume's grid (`rounded_error`).
     """
     from vvgt_cli.dvr import RenderSettings
 
@@ -134,4 +160,5 @@ def verify(certificate: Certificate, field: Field, gaussians: Shown, looked_up: 
     digests = certificate.sha256, None if certificate.sha256 is None else field.digest()
     same = None if None in digests else digests[0] == digests[1]
     recorded = certificate.live_psnr if looked_up and certificate.live_psnr is not None else certificate.psnr
-    return Verdict(same, certificate.look == field.source.shown_as(), round(scores.psnr, 2), recorded)
+    own = certificate.values_psnr
+    return Verdict(same, certificate.look == field.source.shown_as(), round(scores.psnr, 2), recorded, values, own)

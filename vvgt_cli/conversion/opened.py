@@ -18,7 +18,7 @@ from vvgt_cli.field.source import StyledVolume, tf_record, volume_record
 from vvgt_cli.gaussians import PlyOptions
 from vvgt_cli.gaussians.formats.streamed import is_streamed
 from vvgt_cli.gaussians.header import legend_text
-from vvgt_cli.jit.ahead import CONVERT, DRAW, INIT, LIVE, RENDER, for_degree
+from vvgt_cli.jit.ahead import CONVERT, DRAW, INIT, LIVE, RENDER, VOXELIZE, for_degree
 from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.look.resolve import unit_of_values
 from vvgt_cli.look.suggest import fitting
@@ -50,7 +50,7 @@ def open_field(
         _report_source(run, request, source)
         alone = (RENDER, *INIT, *DRAW) if in_blocks else INIT  # views are cast with the blocks
         names = (CONVERT if request.scored else alone) if kernels is None else kernels
-        return for_degree(source.kernels(names + (LIVE if request.live else ())), degree_of(request, source))
+        return for_degree(source.kernels(names + (LIVE + VOXELIZE if request.live else ())), degree_of(request, source))
 
     needs = FieldNeeds(request.budget(), request.fit.screen, request.ply.sh_degree, request.out_of_core, request.live)
     store = nullcontext(BlockStore(Path(str(beside)).absolute())) if shard else store_beside(beside)

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from vvgt_cli.field.field import Field
     from vvgt_cli.look.function import TransferFunction
     from vvgt_cli.look.labels import LabelTable
+    from vvgt_cli.volume import Volume
 
 FROM_THE_SIDE = 4  # test view of pictures by default
 CERTIFICATES = 4096  # bytes of a page that are enough for its certificate
@@ -160,6 +161,15 @@ class Result:
         function, options = resolve_look("result", self.ply, asked)
         found = apply_function(self.gaussians, self.ply, function, options)
         return Result(found, ConversionReport("recolor"), options)
+
+    def voxelize(
+        self, *, dims: Sequence[int] | None = None, spacing: Sequence[float] | None = None, like: Volume | None = None,
+        layer: int | str | None = None, density: bool = False,
+    ) -> Volume:  # fmt: skip
+        """Return live values or labels, or the extinction of any Gaussians, on a grid; see `vvgt_cli.voxelize`."""
+        from vvgt_cli.conversion.voxelize import array_of, planes_of
+
+        return array_of(planes_of("result", self.ply, self.gaussians, dims, spacing, like, layer, density))
 
     def values(self, run: Run | None = None, limit: float | None = None) -> Values | None:
         """Return the values of the volume for a page of at most ``limit`` bytes; None where there are none."""

@@ -369,6 +369,9 @@ class Certificate:
         texture: texture of smooth areas close up, of the Gaussians and of the volume, in levels of 255; None if
             nothing is opaque and smooth.
         position_error: largest distance of a stored centre from the computed one, in world units.
+        values_psnr: PSNR in dB, over the range of values, of a live file's values on the volume's grid
+            (`vvgt voxelize`); None for other files.
+        values_error: the largest error there, data value.
         command: the command line without folders, outputs, names of volumes and options that do not affect the
             result; None from Python.
     """
@@ -385,6 +388,8 @@ class Certificate:
     conditions: tuple[tuple[str, float], ...] = ()
     texture: tuple[float, float] | None = None
     position_error: float = 0.0
+    values_psnr: float | None = None
+    values_error: float | None = None
     command: str | None = None
 
     def facts(self) -> dict[str, Any]:
@@ -409,7 +414,8 @@ class Certificate:
         texture = None if woven is None else (_number(woven[0]), _number(woven[1]))
         kinds = {
             "volume": str, "sha256": str, "look": str, "size": int, "rule": str, "psnr": float, "views": int,
-            "pixels": int, "live_psnr": float, "position_error": float, "command": str,
+            "pixels": int, "live_psnr": float, "position_error": float, "values_psnr": float, "values_error": float,
+            "command": str,
         }  # fmt: skip
         if not {"volume", "look", "size", "rule", "psnr", "views", "pixels"} <= set(values) <= set(kinds):
             raise ValueError(text)

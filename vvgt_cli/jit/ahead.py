@@ -69,6 +69,7 @@ SEGMENTS = {
 }
 CONVERT = (RENDER, AXES_STEPS, *CLOSED_FORM, *DRAW, *DESCENT, *REGRESS, *RAYCAST_REST, *BACK_PROJECT)
 LIVE = ("vvgt_cli.closed_form.gaussian_samples:sample_points",)
+VOXELIZE = ("vvgt_cli.closed_form.values_back:deposit", "vvgt_cli.closed_form.values_back:sample")
 OPTIMIZE = (*REFINE, *DRAW, "vvgt_cli.closed_form.cell_kernels:principal_axes", *SHARED)
 EVALUATE = (*RAYCAST, *DRAW)
 INFER = (*DRAW, PAIR_SUMS, STANDARD, *BACK_PROJECT)
@@ -88,6 +89,7 @@ ALL = (
     *DEPOSITS,
     *SEGMENTS.values(),
     *LIVE,
+    *VOXELIZE,
     VOXEL_MOMENTS,
     *COUNT_WHOLE,
     *COUNT_REAL,

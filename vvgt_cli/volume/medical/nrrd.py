@@ -367,21 +367,29 @@ def write_nrrd(path: str | os.PathLike[str], volume: Volume, overwrite: bool = F
     Errors are those of `atomic_write`.
     """
     values = np.ascontiguousarray(volume.data, "<f4") * np.float32(volume.slope) + np.float32(volume.intercept)
+    with atomic_write(path, overwrite) as temporary:
+        temporary.write_bytes(nrrd_header(volume, "float") + values.astype("<f4", copy=False).tobytes())
+    return Path(path).stat().st_size
+
+
+def nrrd_header(volume: Volume, kind: str, components: int = 1) -> bytes:
+    """Return the header, and the blank line behind it, of raw little-endian values of type ``kind``."""
+    several = components > 1
     vectors = " ".join(
         f"({','.join(repr(v) if v else '0' for v in axis)})" for axis in volume.affine[:3, :3].T.tolist()
     )
     space = {"RAS": "right-anterior-superior", "LPS": "left-posterior-superior"}.get(volume.space or "")
     header = [
         "NRRD0004",
-        "type: float",
-        "dimension: 3",
+        f"type: {kind}",
+        f"dimension: {3 + several}",
         f"space: {space}" if space else "space dimension: 3",
-        f"sizes: {' '.join(map(str, volume.dims))}",
-        f"space directions: {vectors}",
+        f"sizes: {f'{components} ' * several}{' '.join(map(str, volume.dims))}",
+        f"space directions: {'none ' * several}{vectors}",
         f"space origin: ({','.join(repr(float(o)) for o in volume.origin)})",
+        *(["kinds: vector domain domain domain"] if several else []),
+        *([f"space units: {' '.join([chr(34) + volume.unit + chr(34)] * 3)}"] if volume.unit and not space else []),
         "endian: little",
         "encoding: raw",
     ]
-    with atomic_write(path, overwrite) as temporary:
-        temporary.write_bytes(("\n".join(header) + "\n\n").encode() + values.astype("<f4", copy=False).tobytes())
-    return Path(path).stat().st_size
+    return ("\n".join(header) + "\n\n").encode()
