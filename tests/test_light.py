@@ -281,7 +281,7 @@ def test_presets_are_taken_and_overruled():
     ("lights", "options", "message"),
     [
         (("0,0,0",), {}, "--light 0,0,0: its length is 0"),
-        (("sideways",), {}, "--light sideways; expected headlight, X,Y,Z, x"),
+        (("sideways",), {}, "--light sideways; expected studio, overcast, window, FILE.hdr, headlight, X,Y,Z, x"),
         (("anterior",), {}, "--light anterior: the volume states no anatomical space"),
         (("none", "above"), {}, "--light none --light above: expected none, or other lights"),
         ((), {"ambient": 0.3}, "--ambient: there is no light; add --light headlight"),

@@ -17,10 +17,10 @@ import numpy as np
 from vvgt_cli.closed_form.columns import COLOR, COLUMNS, FIRST, MASS, RED, SEEN, SEEN_COLOR, SEEN_RED, X, Y, Z
 from vvgt_cli.closed_form.tree import Leaves, Tree
 from vvgt_cli.dvr.kernel import FLAGS, mean_optics, sample, table_coordinate
-from vvgt_cli.dvr.layout import LIT, Light, Optics, Voxels
+from vvgt_cli.dvr.layout import LIT, TRACED, Light, Optics, Voxels
 from vvgt_cli.dvr.light import sphere
 from vvgt_cli.dvr.scene import Scene
-from vvgt_cli.dvr.shading import arrives, fixed_diffuse, normal, openness
+from vvgt_cli.dvr.shading import arrives, fixed_diffuse, normal, openness, shade_at
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.frames import C2, axes_of, basis
 from vvgt_cli.gaussians.types import HARMONICS, SH_C0
@@ -85,6 +85,11 @@ def _shade(
             y = (cell[Y] / cell[MASS] + half[1]) / step[1] - 0.5
             z = (cell[Z] / cell[MASS] + half[2]) / step[2] - 0.5
             n0, n1, n2 = normals[m, 0], normals[m, 1], normals[m, 2]
+            if light.shadows == TRACED:
+                row[0] += w
+                for c in range(3):
+                    row[10 + c] += shade_at(light, c, x, y, z) * cell[color + c]
+                continue
             open_ = openness(light, x, y, z)
             factor = open_ * (light.ambient + light.diffuse * fixed_diffuse(light, n0, n1, n2, x, y, z))
             row[0] += w

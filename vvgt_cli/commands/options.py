@@ -162,10 +162,11 @@ output_option = click.option(
 )  # fmt: skip
 _LIGHT = dict(
     lights=click.option(
-        "--light", "lights", multiple=True, metavar="none|headlight|X,Y,Z|left|above|...",
+        "--light", "lights", multiple=True, metavar="none|headlight|studio|X,Y,Z|left|...",
         help="Light at the eye ('headlight') or from a direction in the world: X,Y,Z, an axis (x, -x, ...), above, "
-        "below, left, right, anterior, ... Repeatable. Default: a headlight if the function has one, as presets such "
-        "as ct-bone and label maps do, else none.",
+        "below, left, right, anterior, ... Repeatable. Or light from all around, traced along its paths: studio, "
+        "overcast, window, or a picture, FILE.hdr or .exr. Default: a headlight if the function has one, as "
+        "presets such as ct-bone and label maps do, else none.",
     ),
     ambient=click.option(
         "--ambient", type=float, metavar="KA", help="Ambient coefficient. Default: the function's, or 0.1."

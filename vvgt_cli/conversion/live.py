@@ -33,7 +33,7 @@ from vvgt_cli.gaussians.types import concatenate
 from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.histogram import UNIT_SHARE, worth_showing
 from vvgt_cli.look.labels import Label, LabelTable
-from vvgt_cli.look.lighting import Lighting
+from vvgt_cli.look.lighting import Lighting, is_sky
 from vvgt_cli.look.recognise import background_bins
 from vvgt_cli.look.tables import extinction
 from vvgt_cli.score.record import Run
@@ -68,6 +68,7 @@ def check_live(request: ConvertRequest) -> None:
         "--no-comments": not request.ply.comments,
         "--shadows": light.shadows,
         "--ambient-occlusion": light.occlusion is not None,
+        f"--light {' '.join(light.lights)}": any(map(is_sky, light.lights)),
     }
     if names := [name for name, there in given.items() if there]:
         raise NoLiveForm(f"--live: the file is made for every function, without fitting; remove {', '.join(names)}")

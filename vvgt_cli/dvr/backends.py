@@ -38,7 +38,9 @@ def view_renderer(
     if scene.grid is not None:
         raise UsageError(f"the vtk renderer draws one volume under a function; of {scene.tf.name} try vvgt")
     if scene.light is not None and (scene.light.shadows or scene.light.occlusion):
-        raise UsageError("the vtk renderer has neither our shadows nor our ambient occlusion; use the vvgt renderer")
+        raise UsageError(
+            "the vtk renderer has neither our shadows nor our ambient occlusion and skies; use the vvgt renderer"
+        )
     from vvgt_cli.dvr import vtk
 
     return vtk.view_renderer(scene, settings)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,12 +12,24 @@ from vvgt_cli.look.tables import Optics as Optics  # kernels' modules have all t
 
 BRICK_BITS = 3
 BRICK = 1 << BRICK_BITS  # voxels along the edge of a brick of the empty-space map
+TRACED = 2  # `Light.shadows` where light was traced along paths
 TYPES = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))  # of values that kernels read
 
 
 def pairs_fit(shape: Sequence[int]) -> bool:
     """Return whether 32 bits, read at any pair of integers along x, lie within an array of ``shape`` (nz, ny, nx)."""
     return shape[2] > 1 and math.prod(shape) > 3
+
+
+def corners(points: np.ndarray, dims: Sequence[int]) -> Iterator[tuple[list[np.ndarray], np.ndarray]]:
+    """Yield x, y and z (n,) of each of the eight voxels around points (n, 3), clamped, and their weights (n,)."""
+    top = np.array(dims) - 1
+    points = np.clip(points, 0, top)
+    low = np.floor(points).astype(np.int64)
+    ends, shares = (low, np.minimum(low + 1, top)), (1 - (points - low), points - low)
+    for corner in np.ndindex(2, 2, 2):
+        x, y, z = (shares[up][:, axis] for axis, up in enumerate(corner))
+        yield [ends[up][:, axis] for axis, up in enumerate(corner)], x * y * z
 
 
 class _Values(NamedTuple):
@@ -83,8 +95,9 @@ class Light(NamedTuple):
         head: 1 with a light at the eye, else 0.
         directions: (n, 3) float64 unit vectors towards lights at infinity, (x, y, z).
         shade: (m, cz, cy, cx) float32 in [0, 1] at the centres of cubes of voxels: the transmittance towards each
-            light where there are shadows (then m >= n), and last how open each place is where there is occlusion.
-        shadows, occlusion: 1 where ``shade`` has them, else 0.
+            light where there are shadows (then m >= n), and last how open each place is where there is occlusion; or
+            the red, green and blue that arrive from a sky, which may be above 1.
+        shadows, occlusion: 1 where ``shade`` has them, else 0; shadows `TRACED` where it has red, green and blue.
         inv_cell: cells of ``shade`` a voxel.
         edge: (3,) float64 voxel edges, unit-frame lengths, (x, y, z).
         origin: (3,) float64 voxel that ``shade`` is relative to: the first of a block, zeros for a whole volume.

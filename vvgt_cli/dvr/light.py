@@ -5,12 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vvgt_cli.dvr.layout import Light, Voxels
+from vvgt_cli.dvr.layout import TRACED, Light, Voxels
 from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.look.tables import Optics
+
+if TYPE_CHECKING:
+    from vvgt_cli.dvr.traced import Scattering
 
 MAX_CELLS = 1 << 21  # of a grid: 128^3; more cost more time than they show
 ANGLE = 3.0  # degrees: radius of a light as it is seen; six times the sun's
@@ -27,6 +31,7 @@ def scene_light(
     step: np.ndarray,
     shape: Sequence[int],
     extinction: Callable[[int], np.ndarray],
+    matter: Callable[[], Scattering] | None = None,
 ) -> Light:
     """Return the light that falls on a volume.
 
@@ -37,25 +42,32 @@ def scene_light(
         shape: voxels (z, y, x).
         extinction: mean extinction (cz, cy, cx) float32 of cubes of so many voxels; asked for where there are shadows
             or occlusion, which are marched through it.
+        matter: what scatters the light of a sky; asked for where there is one.
     """
     from vvgt_cli.dvr.bricks import dilate
 
     inward = np.linalg.inv(axes)
     directions = np.array([_unit(inward @ np.array(d)) for d in lighting.directions]).reshape(-1, 3)
-    cell, shade = shade_cell(shape), np.ones((1, 1, 1, 1), np.float32)
-    if lighting.attenuated:
+    cell, shade, shadows = shade_cell(shape), np.ones((1, 1, 1, 1), np.float32), int(lighting.shadows)
+    if lighting.sky is not None and matter is not None:
+        from vvgt_cli.dvr.sky import sky_of
+        from vvgt_cli.dvr.traced import light_grid
+
+        sky = sky_of(lighting.sky, np.array(lighting.directions[0]), axes)
+        shade, shadows, directions = light_grid(matter(), sky, shape, cell), TRACED, np.zeros((0, 3))
+    elif lighting.attenuated:
         density, grids = extinction(cell), []
-        matter, wanted = Matter.of(density, step * cell), dilate(density > 0)  # where there is nothing, nothing is lit
+        dense, wanted = Matter.of(density, step * cell), dilate(density > 0)  # where there is nothing, nothing is lit
         if lighting.shadows:
-            grids += [transmittance(matter, cone(d, ANGLE, RAYS), 1, wanted=wanted) for d in directions]
+            grids += [transmittance(dense, cone(d, ANGLE, RAYS), 1, wanted=wanted) for d in directions]
         if lighting.occlusion is not None:
-            around = transmittance(matter, sphere(AROUND), 1, lighting.occlusion, wanted=wanted)
+            around = transmittance(dense, sphere(AROUND), 1, lighting.occlusion, wanted=wanted)
             grids.append(np.minimum(2 * around, 1))  # a plane is open
         shade = np.stack(grids)
     return Light(
         float(lighting.ambient), float(lighting.diffuse), float(lighting.specular), float(lighting.specular_power),
         int(lighting.headlight),
-        np.ascontiguousarray(directions), shade, int(lighting.shadows), int(lighting.occlusion is not None),
+        np.ascontiguousarray(directions), shade, shadows, int(lighting.occlusion is not None),
         1.0 / cell, np.ascontiguousarray(step, np.float64), np.zeros(3),
     )  # fmt: skip
 

@@ -54,13 +54,13 @@ def shade_segment(
     own: Quad, light: Light, values: np.ndarray, p: Vector, d: Vector, look: Vector, s: float
 ) -> tuple[float, float, float]:
     """Shade a segment's ``own`` (r, g, b, alpha) at p + s d, seen along ``look``; no colour exceeds its alpha."""
-    factor, white = shading(
+    r, g, b, white = shading(
         values, light, p[0] + s * d[0], p[1] + s * d[1], p[2] + s * d[2], look[0], look[1], look[2]
     )  # fmt: skip
     most = lane(own, 3)
     white *= most
-    red, green = min(factor * lane(own, 0) + white, most), min(factor * lane(own, 1) + white, most)
-    return red, green, min(factor * lane(own, 2) + white, most)
+    red, green = min(r * lane(own, 0) + white, most), min(g * lane(own, 1) + white, most)
+    return red, green, min(b * lane(own, 2) + white, most)
 
 
 @_jit

@@ -6,29 +6,18 @@ Per segment of length ds, with the scalar s at its middle (Max 1995, eq. 8, by t
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from typing import cast
 
 import numpy as np
 
 from vvgt_cli.cameras import Camera
+from vvgt_cli.dvr.layout import TRACED, corners
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.look.function import TransferFunctionLike
 from vvgt_cli.look.tables import extinction
 from vvgt_cli.volume import Volume
 
 SAMPLES = 4096  # evaluated at a time: bounds the memory
-
-
-def corners(points: np.ndarray, dims: Sequence[int]) -> Iterator[tuple[list[np.ndarray], np.ndarray]]:
-    """Yield x, y and z (n,) of each of the eight voxels around points (n, 3), clamped, and their weights (n,)."""
-    top = np.array(dims) - 1
-    points = np.clip(points, 0, top)
-    low = np.floor(points).astype(np.int64)
-    ends, shares = (low, np.minimum(low + 1, top)), (1 - (points - low), points - low)
-    for corner in np.ndindex(2, 2, 2):
-        x, y, z = (shares[up][:, axis] for axis, up in enumerate(corner))
-        yield [ends[up][:, axis] for axis, up in enumerate(corner)], x * y * z
 
 
 def trilinear(volume: Volume, points: np.ndarray) -> np.ndarray:
@@ -87,10 +76,12 @@ def grid_values(grid: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def shade(scene: Scene, points: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the colours' factor (n,) and white to add (n,) at voxel coordinates (n, 3) seen along (n, 3)."""
+    """Return the colours' factors (n, 1 or 3) and white to add (n,) at voxel coordinates (n, 3) seen along (n, 3)."""
     light = scene.light
     assert light is not None
     at = (points + 0.5) * light.inv_cell - 0.5
+    if light.shadows == TRACED:
+        return grid_values(light.shade.transpose(1, 2, 3, 0), at), np.zeros(len(points))
     normal = normals(scene, points)
     known = normal.any(axis=1)
     diffuse, white = np.zeros(len(points)), np.zeros(len(points))
@@ -103,7 +94,7 @@ def shade(scene: Scene, points: np.ndarray, directions: np.ndarray) -> tuple[np.
         white += part * np.where(length > 1e-9, np.abs((normal * half).sum(axis=1)) ** light.power, 0)
     open_ = grid_values(light.shade[-1], at) if light.occlusion else 1.0
     factor = open_ * (light.ambient + light.diffuse * np.where(known, diffuse, 0))
-    return factor, light.specular * np.where(known, white, 0)
+    return factor[:, None], light.specular * np.where(known, white, 0)
 
 
 def rays(camera: Camera, samples: int) -> tuple[np.ndarray, np.ndarray]:
@@ -136,7 +127,7 @@ def march(scene: Scene, origin: np.ndarray, directions: np.ndarray, step: float)
         tau, rgb = optics_at(scene, points)
         if scene.light is not None:
             factor, white = shade(scene, points, np.tile(directions, (len(t), 1)))
-            rgb = np.minimum(factor[:, None] * rgb + white[:, None], 1)
+            rgb = np.minimum(factor * rgb + white[:, None], 1)
         alpha = -np.expm1(-tau.reshape(t.shape) * ds)
         left = np.cumprod([trans, *(1 - alpha)], axis=0)
         color += ((left[:-1] * alpha)[..., None] * rgb.reshape(*t.shape, 3)).sum(axis=0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +13,9 @@ from vvgt_cli.dvr.light import scene_light
 from vvgt_cli.look import Lighting, Named, TransferFunctionLike
 from vvgt_cli.look.tables import Optics, build_tables
 from vvgt_cli.volume import Volume
+
+if TYPE_CHECKING:
+    from vvgt_cli.dvr.traced import Scattering
 
 
 @dataclass(frozen=True)
@@ -137,9 +141,17 @@ class Scene:
         return scene if lighting is None else scene.lit(lighting)
 
     def lit(self, lighting: Lighting) -> Scene:
-        """Return the same scene under light; shadows and occlusion are marched here."""
-        light = scene_light(lighting, self.volume.axes, self.step, self.values.shape, self._mean_extinction)
+        """Return the same scene under light; shadows and occlusion are marched here, the light of skies is traced."""
+        shape = self.values.shape
+        light = scene_light(lighting, self.volume.axes, self.step, shape, self._mean_extinction, self.scattering)
         return replace(self, lighting=lighting, light=light)
+
+    def scattering(self) -> Scattering:
+        """Return the scene as paths are traced through it."""
+        from vvgt_cli.dvr.traced import Scattering
+
+        texels = None if self.grid is None else self.texels
+        return Scattering(self.voxels, self.optics, texels, self.empty, self.step)
 
     def _mean_extinction(self, cell: int) -> np.ndarray:
         """Average extinction per unit-frame length over cubes of ``cell`` voxels, (cz, cy, cx) float32."""

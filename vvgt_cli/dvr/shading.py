@@ -8,7 +8,7 @@ from typing import Any
 import numba as nb
 import numpy as np
 
-from vvgt_cli.dvr.layout import Light
+from vvgt_cli.dvr.layout import TRACED, Light
 from vvgt_cli.dvr.vectors import Quad, four, lane, mix, sub, vector
 from vvgt_cli.jit.decorators import inlined
 
@@ -150,12 +150,18 @@ def _fixed_highlights(
 @_jit
 def shading(
     values: np.ndarray, light: Light, x: float, y: float, z: float, d0: float, d1: float, d2: float
-) -> tuple[float, float]:
-    """Return (factor of the colour, white to add) at voxel coordinates, seen along the unit vector d (box frame)."""
+) -> tuple[float, float, float, float]:
+    """Return factors of red, green and blue, and white to add at voxel coordinates, seen along the unit vector d.
+
+    d is of the box frame.
+    """
+    if light.shadows == TRACED:
+        return shade_at(light, 0, x, y, z), shade_at(light, 1, x, y, z), shade_at(light, 2, x, y, z), 0.0
     open_ = openness(light, x, y, z)
     n0, n1, n2 = normal(values, light.edge, x, y, z)
     if n0 == 0.0 and n1 == 0.0 and n2 == 0.0:
-        return open_ * light.ambient, 0.0
+        dim = open_ * light.ambient
+        return dim, dim, dim, 0.0
     diffuse, white = fixed_diffuse(light, n0, n1, n2, x, y, z), 0.0
     facing = min(abs(n0 * d0 + n1 * d1 + n2 * d2), 1.0)
     if light.head:
@@ -164,4 +170,5 @@ def shading(
         white = _fixed_highlights(light, n0, n1, n2, d0, d1, d2, x, y, z)
         if light.head:
             white += _power(facing, light.power)
-    return open_ * (light.ambient + light.diffuse * diffuse), light.specular * white
+    factor = open_ * (light.ambient + light.diffuse * diffuse)
+    return factor, factor, factor, light.specular * white

@@ -14,7 +14,7 @@ from vvgt_cli.closed_form.columns import MOMENTS
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.dvr.render import BoxFrame, Rays, RenderSettings, first_rays, for_thin, more_rays
 from vvgt_cli.field.block_store import CELLS, BlockStore
-from vvgt_cli.field.cells import CellBlocks, ExtinctionBlocks, PointBlocks, RayBlocks, ValueBlocks
+from vvgt_cli.field.cells import CellBlocks, ExtinctionBlocks, MeanBlocks, PointBlocks, RayBlocks, ValueBlocks
 from vvgt_cli.field.digests import digest, values_digest
 from vvgt_cli.field.field import Field, Picture, ViewRenderer
 from vvgt_cli.field.grid import CellGrid
@@ -31,6 +31,7 @@ from vvgt_cli.progress import ProgressCallback
 if TYPE_CHECKING:
     from vvgt_cli.closed_form import Start, VbmOptions
     from vvgt_cli.closed_form.moments import Cells
+    from vvgt_cli.dvr.traced import Scattering
     from vvgt_cli.field.cells import Reader
 
 
@@ -118,18 +119,24 @@ class Blocked(Field):
 
     @cached_property
     def light(self) -> Light | None:
-        """Lighting for the kernels; shadows and occlusion take a pass over the blocks."""
+        """Lighting for the kernels; shadows, occlusion and skies take a pass over the blocks."""
         lighting, volume = self.source.lighting, self.source.volume
         if lighting is None:
             return None
-        from vvgt_cli.dvr.light import scene_light
+        from vvgt_cli.dvr.light import scene_light, shade_cell
+
+        def matter() -> Scattering:
+            cell = shade_cell(volume.data.shape)
+            task = MeanBlocks(self.reader, self._grid(np.zeros(3, np.int64), cell), self.run_pass.store, cell)
+            self.run_pass(task, "light")
+            return task.scattering(self.frame.step)
 
         def extinction(cell: int) -> np.ndarray:
             task = ExtinctionBlocks(self.reader, self._grid(np.zeros(3, np.int64), cell), self.run_pass.store, cell)
             self.run_pass(task, "light")
             return task.gathered()
 
-        return scene_light(lighting, volume.axes, self.frame.step, volume.data.shape, extinction)
+        return scene_light(lighting, volume.axes, self.frame.step, volume.data.shape, extinction, matter)
 
     def _grid(self, exponent: np.ndarray, least: int = 1) -> CellGrid:
         """Return a grid of cells of 2^``exponent`` voxels, in blocks made of whole cubes of ``least`` voxels."""

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vvgt_cli.closed_form.columns import FIRST, MASS, MOMENTS
-from vvgt_cli.dvr.layout import Light
+from vvgt_cli.dvr.layout import Light, Texels, Voxels
 from vvgt_cli.field.block_store import CELLS, BlockStore
 from vvgt_cli.field.grid import CellGrid
 from vvgt_cli.field.rays import HALO, LIT_HALO, RayFile, save_rays
 from vvgt_cli.field.reader import Layers, Scalars, VoxelBox
 from vvgt_cli.files import atomic_write
+
+if TYPE_CHECKING:
+    from vvgt_cli.dvr.traced import Scattering
 
 NORMALS = ".normals.npy"
 Reader = Scalars | Layers
@@ -237,10 +241,40 @@ class ExtinctionBlocks(Blockwise):
         self.store.save(self.kind, number, extinction=out)
 
     def gathered(self) -> np.ndarray:
-        """Return the cells of the whole volume, (cz, cy, cx) float32; raise DataError if one is missing or damaged."""
-        out = np.empty(tuple(-(-int(n) // self.cell) for n in self.grid.dims[::-1]), np.float32)
+        """Return the cells of the whole volume, (cz, cy, cx[, 4]); raise DataError if one is missing or damaged."""
+        shape, out = tuple(-(-int(n) // self.cell) for n in self.grid.dims[::-1]), np.empty(0, np.float32)
         for number in range(len(self)):
             x, y, z = (int(n) // self.cell for n in self.grid.blocks.at(number)[0])
-            part = self.store.load(self.kind, number)["extinction"]
+            part = self.store.load(self.kind, number)[self.kind]
+            out = out if len(out) else np.empty((*shape, *part.shape[3:]), np.float32)
             out[z : z + part.shape[0], y : y + part.shape[1], x : x + part.shape[2]] = part
         return out
+
+
+@dataclass(frozen=True)
+class MeanBlocks(ExtinctionBlocks):
+    """Mean values, or texels of an optics grid, of the cells through which the light of a sky is traced."""
+
+    kind: str = "means"
+
+    def __call__(self, number: int) -> None:
+        """Save the cells of block ``number``."""
+        box = self.box(number, 0)
+        means = np.asarray(box.values if box.grid is None else box.grid, np.float64)
+        for axis, n in enumerate(box.values.shape):
+            first = np.arange(0, n, self.cell)
+            means = np.add.reduceat(means, first, axis)
+            means /= np.diff([*first, n]).reshape(-1, *[1] * (means.ndim - 1 - axis))
+        self.store.save(self.kind, number, means=means.astype(np.float32))
+
+    def scattering(self, step: np.ndarray) -> Scattering:
+        """Return what `gathered` does as paths are traced through it; ``step`` (3,) voxel edges, unit frame."""
+        from vvgt_cli.dvr.bricks import brick_ranges, empty_distance
+        from vvgt_cli.dvr.traced import Scattering
+
+        means, optics = self.gathered(), self.reader.box(np.zeros(3, np.int64), np.ones(3, np.int64)).optics
+        values = means if means.ndim == 3 else np.ascontiguousarray(means[..., 3])
+        values.flags.writeable = False
+        empty = empty_distance(brick_ranges(values), optics)
+        texels = None if means.ndim == 3 else Texels(means)
+        return Scattering(Voxels(values), optics, texels, empty, step * self.cell, self.cell)

@@ -15,6 +15,7 @@ from vvgt_cli.cameras.files import read_frames
 from vvgt_cli.cameras.types import Camera
 from vvgt_cli.errors import DataError
 from vvgt_cli.files import atomic_write
+from vvgt_cli.volume.blocks import check_memory
 
 SUFFIXES = (".exr", ".png")  # the first that exists is read
 
@@ -167,6 +168,7 @@ def _camera_of(text: Any, path: str | PathLike[str]) -> Camera | None:
 
 
 MAX_PIXELS = 2**28  # 16384 x 16384, because a damaged header may claim anything
+RADIANCE_BYTES = 72  # a pixel of light, with sums over it
 MAX_PIXELS_PER_BYTE = 2**14  # more than deflate can reach for one-bit pixels
 
 
@@ -261,3 +263,28 @@ def _bytes(image: np.ndarray) -> np.ndarray:
         straight = np.divide(image[..., :3], alpha, out=np.zeros_like(image[..., :3]), where=alpha > 0)
         image = np.concatenate([np.minimum(straight, 1), alpha], axis=-1)
     return np.ascontiguousarray(np.rint(image * 255).astype(np.uint8))
+
+
+def read_radiance(path: str | PathLike[str]) -> np.ndarray:
+    """Read a picture of light, ``.hdr`` or ``.exr``: (h, w, 3) float32, linear; grey ones as red, green and blue.
+
+    Raises:
+        DataError: no such picture, a damaged one, or one larger than 2^28 pixels.
+    """
+    import OpenImageIO as oiio
+
+    source = oiio.ImageInput.open(str(path)) if Path(path).is_file() else None
+    if source is None:
+        reason = oiio.geterror().splitlines() or ["no such file"]
+        raise DataError(f"{path}: cannot be read ({reason[0]}); expected a picture of light, .hdr or .exr")
+    try:
+        spec = source.spec()
+        check_pixels(path, spec.width, spec.height)
+        check_memory(RADIANCE_BYTES * spec.width * spec.height, str(path), "try a smaller picture")
+        pixels = source.read_image(oiio.FLOAT)
+        if pixels is None:
+            raise DataError(f"{path}: damaged ({' '.join(source.geterror().split())}); expected a complete picture")
+    finally:
+        source.close()
+    pixels = np.asarray(pixels, np.float32).reshape(spec.height, spec.width, spec.nchannels)
+    return pixels[..., :3] if spec.nchannels >= 3 else np.repeat(pixels[..., :1], 3, axis=-1)

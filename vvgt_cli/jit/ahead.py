@@ -6,6 +6,7 @@ RENDER, RENDER_LIT = "vvgt_cli.dvr.march:render_tiles", "vvgt_cli.dvr.march:rend
 BLOCK_RANGES = "vvgt_cli.dvr.bricks:block_ranges"
 SHADE = ("vvgt_cli.closed_form.lit:_shade", "vvgt_cli.closed_form.lit:point_normals")
 SHADOWS = ("vvgt_cli.dvr.shadows:mean_transmittance", "vvgt_cli.dvr.shadows:cell_extinction")
+PATHS = ("vvgt_cli.dvr.paths:gather", "vvgt_cli.dvr.paths:first_scatterings")
 MARCH, ADD_CELLS = "vvgt_cli.closed_form.visibility:march", "vvgt_cli.closed_form.visibility:add_cells"
 BLOCK_MOMENTS, COMPACT = "vvgt_cli.closed_form.quadrature:block_moments", "vvgt_cli.closed_form.quadrature:compact"
 VOXEL_MOMENTS = "vvgt_cli.closed_form.voxelwise:voxel_moments"  # of cells wider than voxels
@@ -22,6 +23,7 @@ GRID = {
     RENDER: "vvgt_cli.dvr.march:render_grid_tiles",
     RENDER_LIT: "vvgt_cli.dvr.march:render_lit_grid_tiles",
     BLOCK_MOMENTS: "vvgt_cli.closed_form.grid:grid_moments",
+    PATHS[0]: "vvgt_cli.dvr.paths:gather_grid",
 }
 DRAW = (
     *(f"vvgt_cli.splat.kernel:{name}" for name in ("count_pairs", "sum_pairs", "file_pairs")),
@@ -80,6 +82,7 @@ ALL = (
     RENDER_LIT,
     *SHADE,
     *SHADOWS,
+    *PATHS,
     *GRID.values(),
     "vvgt_cli.dvr.place:place",
     STANDARD,
@@ -99,10 +102,10 @@ ALL = (
 )
 
 
-def for_light(names: tuple[str, ...], attenuated: bool) -> tuple[str, ...]:
-    """Return the kernels of a command whose scene is lit, ``attenuated`` by shadows or occlusion."""
+def for_light(names: tuple[str, ...], attenuated: bool, sky: bool = False) -> tuple[str, ...]:
+    """Return the kernels of a command whose scene is lit, ``attenuated`` by shadows or occlusion, or by a ``sky``."""
     rays = tuple(RENDER_LIT if name == RENDER else name for name in names)
-    return (*rays, *(SHADE if MARCH in names else ()), *(SHADOWS if attenuated else ()))
+    return (*rays, *(SHADE if MARCH in names else ()), *(PATHS if sky else SHADOWS if attenuated else ()))
 
 
 def for_degree(names: tuple[str, ...], degree: int) -> tuple[str, ...]:

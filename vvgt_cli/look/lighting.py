@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
+from urllib.parse import quote, unquote
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.space import world_axis
@@ -15,10 +16,20 @@ COEFFICIENTS = ("ambient", "diffuse", "specular", "specular_power")
 HEADLIGHT, NONE = "headlight", "none"
 MAX_LIGHT = 1000.0  # of a coefficient: a highlight with a larger power is a point
 AXES = {axis: tuple(float(letter == axis) for letter in "xyz") for axis in "xyz"}
+SKIES = ("studio", "overcast", "window")  # light from all around, traced along paths
 WORDS = ("left", "right", "anterior", "posterior", "superior", "inferior", "above", "below")
-EXPECTED = f"expected {HEADLIGHT}, X,Y,Z, x, -x, y, -y, z, -z, {', '.join(WORDS[:-1])} or {WORDS[-1]}"
+EXPECTED = (
+    f"expected {', '.join(SKIES)}, FILE.hdr, {HEADLIGHT}, X,Y,Z, x, -x, y, -y, z, -z, {', '.join(WORDS[:-1])} or "
+    f"{WORDS[-1]}"
+)
 
+PICTURES = (".hdr", ".exr")  # of skies
 Direction = tuple[float, float, float]
+
+
+def is_sky(light: str) -> bool:
+    """Return whether a light is one from all around: one of `SKIES`, or a picture of `PICTURES`."""
+    return light in SKIES or light.lower().endswith(PICTURES)
 
 
 @dataclass(frozen=True)
@@ -31,10 +42,12 @@ class Lighting:
         ambient, diffuse, specular, specular_power: ka, kd, ks, p.
         shadows: lights at infinity are attenuated on their way.
         occlusion: unit-frame length within which surroundings attenuate ambient and diffuse light; None: not at all.
+        sky: one of `SKIES` or the path of a picture, which lights alone, in place of the model above: ``directions``
+            then holds the one in which its viewer stands.
 
     Raises:
         UsageError: no light, a direction of length zero, a coefficient outside of [0, `MAX_LIGHT`],
-            shadows without a light that casts any.
+            shadows without a light that casts any, other lights or options beside a sky.
     """
 
     headlight: bool = True
@@ -45,9 +58,15 @@ class Lighting:
     specular_power: float = POWER
     shadows: bool = False
     occlusion: float | None = None
+    sky: str | None = None
 
     def __post_init__(self) -> None:
         """Check lights and coefficients."""
+        if self.sky is not None and (self.headlight or len(self.directions) != 1 or self.shadows or self.occlusion):
+            raise UsageError(
+                f"--light {self.sky}: a sky lights alone, with shadows of its own; remove other lights, --shadows and "
+                "--ambient-occlusion, but one direction, X,Y,Z, where its viewer stands"
+            )
         if not (self.headlight or self.directions):
             raise UsageError(f"no light; {EXPECTED}")
         for name in COEFFICIENTS:
@@ -62,18 +81,18 @@ class Lighting:
     @property
     def depends_on_view(self) -> bool:
         """Return whether colours change with the eye."""
-        return (self.headlight and self.diffuse > 0) or self.specular > 0
+        return self.sky is None and ((self.headlight and self.diffuse > 0) or self.specular > 0)
 
     @property
     def attenuated(self) -> bool:
-        """Return whether light is marched through the scene, for shadows or occlusion."""
-        return self.shadows or self.occlusion is not None
+        """Return whether light is followed through the scene, for shadows, occlusion or a sky."""
+        return self.shadows or self.occlusion is not None or self.sky is not None
 
     def text(self) -> str:
         """Return one line for the header of a `.ply`; `parse_lighting` reads it."""
         words = [repr(float(getattr(self, name))) for name in COEFFICIENTS]
         words += [HEADLIGHT] * self.headlight + [",".join(repr(v) for v in d) for d in self.directions]
-        words += ["shadows"] * self.shadows
+        words += ["shadows"] * self.shadows + ([] if self.sky is None else ["sky", quote(self.sky)])
         return " ".join(words + ([] if self.occlusion is None else ["occlusion", repr(float(self.occlusion))]))
 
 
@@ -82,14 +101,17 @@ def parse_lighting(text: str) -> Lighting:
     words = text.split()
     numbers: list[Any] = [float(word) for word in words[:4]]
     rest = words[4:]
-    occlusion = None
-    if "occlusion" in rest:
-        at = rest.index("occlusion")
-        occlusion, rest = float(rest[at + 1]), rest[:at] + rest[at + 2 :]
-    lighting = Lighting(HEADLIGHT in rest, _directions([w for w in rest if "," in w], None), *numbers)
+    more: dict[str, str] = {}
+    for name in {"occlusion", "sky"}.intersection(rest):
+        at = rest.index(name)
+        more[name], rest = rest[at + 1], rest[:at] + rest[at + 2 :]
+    sky = unquote(more["sky"]) if "sky" in more else None
+    occlusion = float(more["occlusion"]) if "occlusion" in more else None
     if known := set(rest) - {HEADLIGHT, "shadows"} - {w for w in rest if "," in w}:
         raise ValueError(known)
-    return replace(lighting, shadows="shadows" in rest, occlusion=occlusion)
+    toward = _directions([w for w in rest if "," in w], None)
+    lighting = Lighting(HEADLIGHT in rest, toward, *numbers)
+    return replace(lighting, shadows="shadows" in rest, occlusion=occlusion, sky=sky)
 
 
 @dataclass(frozen=True)
@@ -97,7 +119,8 @@ class LightOptions:
     """Lighting options of a user; None leaves the choice to the function's file, else to VTK's defaults.
 
     Attributes:
-        lights: ``none``, ``headlight``, ``X,Y,Z``, an axis or a word of `WORDS`; empty: those of the function's file.
+        lights: ``none``, ``headlight``, one of `SKIES`, a picture, ``X,Y,Z``, an axis or a word of `WORDS`; empty:
+            those of the function's file.
         ambient, diffuse, specular, specular_power: coefficients.
         shadows, occlusion: as in `Lighting`.
     """
@@ -133,11 +156,25 @@ class LightOptions:
         if not self.lights:
             assert preset is not None
             return replace(preset, **given)
+        if skies := [light for light in self.lights if is_sky(light)]:
+            return self._sky(skies[0], space, given)
         fixed = _directions([light for light in self.lights if light != HEADLIGHT], space)
         if len(self.lights) - len(fixed) > 1:
             raise UsageError("--light headlight: given twice; expected once")
         kept = {} if preset is None else {name: getattr(preset, name) for name in COEFFICIENTS}
         return Lighting(HEADLIGHT in self.lights, fixed, **(kept | given))
+
+    def _sky(self, sky: str, space: str | None, given: dict[str, Any]) -> Lighting:
+        """Return the light of a sky, whose viewer stands in front of a body, else at -y."""
+        front = [light for light in self.lights if light != sky] or ["-y" if space is None else "anterior"]
+        if unused := sorted(set(given) & set(COEFFICIENTS)):
+            raise UsageError(
+                f"--{unused[0].replace('_', '-')}: matter under --light {sky} scatters all that its colour does not "
+                "absorb; remove it"
+            )
+        if len(front) > 1 or front[0] == HEADLIGHT or is_sky(front[0]):
+            front = []
+        return Lighting(False, _directions(front, space), **given, sky=sky)
 
 
 MATTE = Lighting(ambient=0.2, diffuse=1.0, specular=0.0)  # as most presets of 3D Slicer have it

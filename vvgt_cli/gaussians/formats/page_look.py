@@ -125,6 +125,7 @@ def _layer_entry(layer: LiveFacts, scale: float, offered: Mapping[str, Any], sho
 
 def _light(lighting: Lighting | None, axes: np.ndarray) -> dict[str, Any]:
     """Return the initial light of the page: the file's headlight, else its first light, or none, of `MATTE` matter."""
+    lighting = MATTE if lighting is not None and lighting.sky else lighting  # the page's rays know no sky
     one = lighting or MATTE
     kind = "none" if lighting is None else "headlight" if one.headlight else "direction"
     toward = np.array(one.directions[0] if one.directions else (-0.5, -0.7, 0.5)) @ axes

@@ -1,0 +1,199 @@
+"""Light traced along paths: against a twin, closed forms and the white furnace; skies; the grid and its views."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests import paths_twin
+from tests.test_light import blob, camera, function
+from vvgt_cli.dvr import RenderSettings, Scene, render_view, render_view_reference
+from vvgt_cli.dvr.light import sphere
+from vvgt_cli.dvr.sky import COLUMNS, ROWS, Sky, directions, sky_of
+from vvgt_cli.dvr.traced import lines, path_view
+from vvgt_cli.errors import UsageError
+from vvgt_cli.look.lighting import SKIES, LightOptions, parse_lighting
+from vvgt_cli.volume import Volume
+
+FRONT = np.array([0.0, -1.0, 0.0])
+
+
+def uniform(level=1.0):
+    share = np.arange(1, ROWS * COLUMNS + 1) / (ROWS * COLUMNS)
+    return Sky(np.full((ROWS, COLUMNS, 3), level), share)
+
+
+def body(opacity=0.6, color=1.0, n=9, values=None):
+    """A ramp along all axes, or a homogeneous cube, of one colour."""
+    values = (
+        np.add.outer(np.add.outer(np.arange(n), np.arange(n)), np.arange(n)) / (3 * n - 3.0)
+        if values is None
+        else values
+    )
+    tf = function([0, 0.4, 0.5, 1], [0, 0, opacity, opacity], [[color] * 3] * 4)
+    return Scene.build(Volume(values.astype(np.float32)), tf, 1.0)
+
+
+def light_at(matter, sky, points, paths, seed=3):
+    first = np.zeros(len(points), np.int64)
+    return matter.gathered(sky, seed, points, first, first + paths)[:, :3] / paths
+
+
+def seen(scene, count=400, **more):
+    matter = replace(scene.scattering(), **more)
+    rays = lines(scene.values.shape, scene.step, 4 * count, np.random.default_rng(0))
+    return matter, matter.scattered(rays, 5)[:count, :6]
+
+
+@pytest.mark.parametrize("opacity", [1e-6, 0.3, 1 - 1e-5])
+@pytest.mark.parametrize("phase", [0.0, 0.95])
+def test_white_matter_in_a_white_furnace_is_white(opacity, phase):
+    """Whatever scatters, as much light arrives as the sky sends: none gained, and lost by long paths alone."""
+    matter, points = seen(body(opacity, n=7), 60, phase=phase)
+    if opacity == 1e-6:
+        points = lines((7, 7, 7), matter.step, 60, np.random.default_rng(0))
+    found = light_at(matter, uniform(), points, 60)
+    assert (found <= 1 + 1e-9).mean() > 0.4
+    assert (0.97 if opacity < 0.9 else 0.92) < found.mean() < 1.02
+
+
+@pytest.mark.parametrize("unit", [1e6, 1.0, 1e-6])
+def test_light_is_finite_in_time_and_never_more_than_the_skys(unit):
+    """At optical depths of 1e-6 to 1e7 a voxel, black, grey and white."""
+    for color in (0.0, 0.5, 1.0):
+        values = np.random.default_rng(0).random((6, 7, 8)).astype(np.float32)
+        scene = Scene.build(Volume(values), function([0, 0.5, 1], [0, 0.3, 1], [[color] * 3] * 3), unit)
+        matter = replace(scene.scattering(), phase=0.95)
+        points = lines((6, 7, 8), scene.step, 50, np.random.default_rng(0))
+        found = light_at(matter, uniform(2.0), points, 20)
+        assert np.isfinite(found).all()
+        assert found.min() >= 0
+        assert found.mean() < 2.1
+
+
+def test_black_matter_gets_what_comes_straight():
+    """In the middle of a homogeneous cube: the mean transmittance to its faces."""
+    scene = body(0.2, 0.0, values=np.ones((7, 7, 7)))
+    around = sphere(4000)
+    depth = -math.log(0.8) * 3.5 / np.abs(around).max(axis=1)
+    point = np.array([[3.0, 3.0, 3.0, 0.0, 0.0, 1.0]])
+    found = light_at(scene.scattering(), uniform(), point, 4000)
+    np.testing.assert_allclose(found, np.exp(-depth).mean(), rtol=0.02)
+
+
+@pytest.mark.parametrize("g", [0.0, 0.7])
+@pytest.mark.parametrize("name", ["studio", "window"])
+def test_paths_bring_what_the_twins_do(name, g):
+    scene, sky = blob(), sky_of(name, FRONT, np.eye(3))
+
+    def light(along):
+        row = np.clip(((1 - along[:, 2]) / 2 * ROWS).astype(int), 0, ROWS - 1)
+        turn = np.arctan2(along[:, 1], along[:, 0]) / (2 * math.pi) % 1
+        return sky.radiance[row, np.minimum((turn * COLUMNS).astype(int), COLUMNS - 1)]
+
+    matter, points = seen(scene, 60, phase=g)
+    found = light_at(matter, sky, points, 200).mean(axis=0)
+    rng, twins = np.random.default_rng(1), []
+    for _ in range(12):
+        twins.append(paths_twin.arriving(scene, light, points, rng, g=g).mean(axis=0))
+    error = np.std(twins, axis=0) / math.sqrt(len(twins))
+    assert (np.abs(found - np.mean(twins, axis=0)) < 4 * error + 0.004).all()
+    assert (error < 0.06).all()
+
+
+def test_a_paths_numbers_depend_on_nothing_but_its_own():
+    """So that threads, which take points in any order, change nothing."""
+    matter, points = seen(blob(), 150)
+    sky = sky_of("studio", FRONT, np.eye(3))
+    whole = light_at(matter, sky, points, 3)
+    np.testing.assert_array_equal(light_at(matter, sky, points[:90], 3), whole[:90])
+    assert len(np.unique(whole[:, 0])) > 140
+    assert np.abs(light_at(matter, sky, points, 3, seed=77) - whole).mean() > 0.01
+
+
+def test_an_optics_grid_scatters_as_the_values_it_was_made_of():
+    scene = body(0.3, 0.6)
+    tau = np.clip((scene.values - 0.4) / 0.1, 0, 1) * 0.3
+    grid = np.repeat(tau[..., None], 4, axis=3).astype(np.float32) * [0.6, 0.6, 0.6, 1]
+    other = Scene.of_grid(scene.volume, scene.tf, 1.0, np.ascontiguousarray(grid, np.float32))
+    sky = sky_of("overcast", FRONT, np.eye(3))
+    matter, points = seen(scene)
+    mean = light_at(matter, sky, points, 20).mean()
+    assert light_at(other.scattering(), sky, points, 20).mean() == pytest.approx(mean, rel=0.1)
+
+
+# Skies.
+
+
+@pytest.mark.parametrize("name", SKIES)
+def test_a_sky_is_exposed_for_a_white_surface(name):
+    sky = sky_of(name, FRONT, np.eye(3))
+    assert (sky.radiance >= 0).all()
+    matt = np.clip(sphere(500) @ directions().T, 0, None) @ sky.radiance.reshape(-1, 3) * 4 / ROWS / COLUMNS
+    assert matt.mean(axis=1).max() == pytest.approx(1, abs=0.02)
+    assert sky.cumulative[-1] == 1
+
+
+def test_a_sky_turns_with_its_viewer_and_stays_in_the_world():
+    front, left = (sky_of("window", np.array(d, float), np.eye(3)).radiance for d in ((0, -1, 0), (-1, 0, 0)))
+    np.testing.assert_allclose(np.roll(front, -COLUMNS // 4, axis=1), left, rtol=5e-3)
+    quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    turned = sky_of("window", FRONT, quarter).radiance
+    np.testing.assert_allclose(np.roll(front, -COLUMNS // 4, axis=1), turned, rtol=5e-3)
+
+
+# The grid, and what is asked for.
+
+
+def test_views_show_the_light_of_paths():
+    """Ray-cast with the light on a grid, and path-traced from the eye; and both ray casters alike."""
+    scene, lighting = blob(20), LightOptions(("studio",)).lighting(None, None)
+    lit, view = scene.lit(lighting), camera(24)
+    sky = sky_of("studio", np.array(lighting.directions[0]), scene.volume.axes)
+    image = render_view(lit, view, RenderSettings(samples=3))
+    traced = path_view(scene.scattering(), sky, scene.half, view, 200)
+    error = (image - traced)[..., :3]
+    assert -10 * math.log10((error**2).mean()) > 33
+    twin = render_view_reference(lit, camera(12), step=1 / 16)
+    assert np.abs(render_view(lit, camera(12), RenderSettings(step=0.125, samples=1)) - twin).max() < 5e-3
+    again = scene.lit(lighting)
+    np.testing.assert_array_equal(again.light.shade, lit.light.shade)
+
+
+@pytest.mark.parametrize("values", [np.zeros((5, 4, 6)), np.ones((5, 4, 6)), np.full((3, 3, 3), np.nan)])
+def test_volumes_that_are_empty_or_opaque_everywhere_are_lit(values):
+    scene = body(1.0, 0.7, values=values)
+    lit = scene.lit(LightOptions(("overcast",)).lighting(None, None))
+    image = render_view(lit, camera(8), RenderSettings(samples=1))
+    assert np.isfinite(image).all()
+    assert np.isfinite(lit.light.shade).all()
+    assert bool(image.any()) == bool(np.nan_to_num(values).any())
+
+
+def test_a_sky_is_asked_for_by_name():
+    found = LightOptions(("studio",)).lighting(None, "RAS")
+    assert (found.sky, found.directions, found.headlight) == ("studio", ((0, 1, 0),), False)
+    assert LightOptions(("studio", "left")).lighting(None, None).directions == ((-1, 0, 0),)
+    assert found.attenuated
+    assert not found.depends_on_view
+    named = replace(found, sky="a place/of light.hdr")
+    assert parse_lighting(named.text()) == named
+
+
+@pytest.mark.parametrize(
+    ("lights", "options", "message"),
+    [
+        (("studio", "headlight"), {}, "--light studio: a sky lights alone"),
+        (("studio", "window"), {}, "--light studio: a sky lights alone"),
+        (("studio",), {"shadows": True}, "--light studio: a sky lights alone"),
+        (("studio",), {"occlusion": 0.1}, "--light studio: a sky lights alone"),
+        (("studio",), {"ambient": 0.1}, "--ambient: matter under --light studio"),
+        (("studio", "none"), {}, "expected none, or other lights, not both"),
+    ],
+)
+def test_what_does_not_go_with_a_sky_is_said_in_one_line(lights, options, message):
+    with pytest.raises(UsageError) as error:
+        LightOptions(lights, **options).lighting(None, None)
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
