@@ -13,6 +13,8 @@ from vvgt_cli.dvr.light import sphere
 from vvgt_cli.dvr.sky import COLUMNS, ROWS, Sky, directions, sky_of
 from vvgt_cli.dvr.traced import lines, path_view
 from vvgt_cli.errors import UsageError
+from vvgt_cli.gaussians import read_ply
+from vvgt_cli.images.files import read_png
 from vvgt_cli.look.lighting import SKIES, LightOptions, parse_lighting
 from vvgt_cli.volume import Volume
 
@@ -197,3 +199,77 @@ def test_what_does_not_go_with_a_sky_is_said_in_one_line(lights, options, messag
         LightOptions(lights, **options).lighting(None, None)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
+
+
+# Commands: in blocks, of labels, and pictures of light.
+
+
+def bodies(tmp_path, labels=False):
+    """Path of a .npy with a ball in front of a wall, or of a label map of them."""
+    z, y, x = np.indices((20, 24, 28))
+    ball = np.clip(8 - np.sqrt((x - 12) ** 2 + (y - 8) ** 2 + (z - 10) ** 2), 0, 4) / 4
+    values = np.round(255 * np.maximum(ball, 0.8 * (y > 20)))
+    path = tmp_path / ("labels.npy" if labels else "values.npy")
+    np.save(path, ((values > 120).astype(np.uint8) + (y > 20) * (values > 120)) if labels else values.astype(np.uint8))
+    return path
+
+
+@pytest.mark.parametrize("labels", [False, True])
+def test_blocks_and_labels_are_lit_as_in_memory(vvgt, tmp_path, labels):
+    path = bodies(tmp_path, labels)
+    look = ("--labels", "auto") if labels else ("--tf", "bone", "--opacity-unit-distance", 2)
+    vvgt.ok("render", path, *look, "--light", "studio", "--size", 40, "-qo", tmp_path / "whole.png")
+    vvgt.ok("render", path, *look, "--light", "studio", "--size", 40, "--blocks", 16, "-qo", tmp_path / "blocks.png")
+    vvgt.ok("render", path, *look, "--light", "none", "--size", 40, "-qo", tmp_path / "flat.png")
+    whole, blocks, flat = (read_png(tmp_path / f"{name}.png") for name in ("whole", "blocks", "flat"))
+    assert np.abs(whole - blocks).mean() < 2e-3
+    assert np.abs(whole - flat).mean() > 2e-2
+    fit = ("--light", "window", "--max-gaussians", 500, "--screen", 60, "-q")
+    vvgt.ok("init", path, *look, *fit, "-o", tmp_path / "a.ply")
+    vvgt.ok("init", path, *look, *fit, "--blocks", 16, "-o", tmp_path / "b.ply")
+    (a, header), (b, _) = read_ply(tmp_path / "a.ply"), read_ply(tmp_path / "b.ply")
+    assert header.light.sky == "window"
+    assert a.harmonics is None or not a.harmonics.any()
+    assert abs(a.colors.mean() - b.colors.mean()) < 0.01
+
+
+def write_light(path, pixels):
+    import OpenImageIO as oiio
+
+    out = oiio.ImageOutput.create(str(path))
+    out.open(str(path), oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], oiio.FLOAT))
+    out.write_image(pixels.astype(np.float32))
+    out.close()
+    return path
+
+
+@pytest.mark.parametrize("ending", ["hdr", "exr"])
+def test_a_picture_shines_from_where_it_is_bright(tmp_path, ending):
+    """A spot an eighth of the width to the right of the middle, 45 degrees up: behind, at the viewer's right."""
+    pixels = np.full((64, 128, 3), 0.01)
+    pixels[15:17, 79:81] = [30, 20, 10]
+    sky = sky_of(str(write_light(tmp_path / f"spot.{ending}", pixels)), FRONT, np.eye(3))
+    brightest = directions()[sky.radiance.sum(axis=2).argmax()]
+    np.testing.assert_allclose(brightest, [0.5, 0.5, math.sqrt(0.5)], atol=0.06)
+    red, _, blue = sky.radiance.reshape(-1, 3)[sky.radiance.sum(axis=2).argmax()]
+    assert red == pytest.approx(3 * blue, rel=0.02)
+    one = sky_of(str(write_light(tmp_path / f"one.{ending}", np.ones((1, 1, 3)))), FRONT, np.eye(3))
+    np.testing.assert_allclose(one.radiance, 1, rtol=0.05)
+
+
+@pytest.mark.parametrize("wrong", ["negative", "infinite", "none", "half", "missing"])
+def test_damaged_pictures_are_refused_in_one_line(vvgt, tmp_path, wrong):
+    path, pixels = tmp_path / "light.exr", np.random.default_rng(0).random((16, 32, 3))
+    pixels[3, 3] = {"negative": -1, "infinite": np.inf}.get(wrong, 1)
+    if wrong != "missing":
+        write_light(path, pixels * (wrong != "none"))
+    if wrong == "half":
+        path.write_bytes(path.read_bytes()[:1500])
+    message = {"half": "damaged", "missing": "no such file", "none": "none"}.get(wrong, "negative or not finite")
+    line = ("render", bodies(tmp_path), "--tf", "bone", "--light", path, "-qo", tmp_path / "a.png")
+    assert message in vvgt.fails(1, *line)
+
+
+def test_what_needs_the_volume_refuses_skies(vvgt, tmp_path):
+    line = ("--tf", "bone", "--light", "studio", "--live", "-qo", tmp_path / "a.ply")
+    assert "remove --light studio" in vvgt.fails(2, "convert", bodies(tmp_path), *line)
