@@ -41,6 +41,7 @@ TABLES = [
     ("dvr_pixels", {}, "SCENES -o a.csv", "reference_db", 20),
     ("dvr_vtk", VTK | {"REPEATS": 1, "OURS": (0.5, 1.0)}, "SCENES -o a.csv --sizes 50", "vtk_db", 15),
     ("grids", {"K": 60, "SIZE": SIZE}, "SCENES -o a.csv --repeats 1", "view_s", 0),
+    ("light_paths", {}, "SCENES -o a.csv --size 8 --paths 8", "grid_db", 8),
     ("light_vtk", VTK, "SCENES -o a.csv --size 50", "gpu_db", 15),
     ("live", {"SIZE": SIZE}, "SCENES -o a.csv --gaussians 200 --direct", "live", 15),
     ("live", {"SIZE": SIZE}, "SCENES -o a.csv --gaussians 200 --lit", "closed form", 15),

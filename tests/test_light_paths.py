@@ -273,3 +273,11 @@ def test_damaged_pictures_are_refused_in_one_line(vvgt, tmp_path, wrong):
 def test_what_needs_the_volume_refuses_skies(vvgt, tmp_path):
     line = ("--tf", "bone", "--light", "studio", "--live", "-qo", tmp_path / "a.ply")
     assert "remove --light studio" in vvgt.fails(2, "convert", bodies(tmp_path), *line)
+
+
+def test_a_page_says_what_its_rays_lack(vvgt, tmp_path):
+    fit = ("--tf", "bone", "--light", "studio", "--max-gaussians", 300, "--screen", 40, "--steps", 4)
+    result = vvgt("convert", bodies(tmp_path), *fit, "-o", tmp_path / "a.html")
+    assert result.code == 0
+    assert "the page lights other looks by a headlight: its own rays know no sky" in result.err
+    assert "a.html" in result.err

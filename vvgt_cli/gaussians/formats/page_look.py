@@ -94,6 +94,8 @@ def look_entry(values: Values, options: PlyOptions) -> dict[str, Any]:
     scale, axes = options.scale or 1.0, _axes(upright(options).up)
     if options.light is not None and options.light.headlight + len(options.light.directions) > 1:
         warnings.warn("the page shows one light at a time under other looks, and begins with the first", stacklevel=2)
+    if options.light is not None and options.light.sky:
+        warnings.warn("the page lights other looks by a headlight: its own rays know no sky", stacklevel=2)
     steps = options.story.steps if options.story else ()
     first, shown = values.facts[0], {str(step.get("function")) for step in steps}
     half = np.linalg.norm(np.reshape(first["affine"], (3, 4))[:, :3], axis=0) * first["dims"] * scale / 2
@@ -125,7 +127,7 @@ def _layer_entry(layer: LiveFacts, scale: float, offered: Mapping[str, Any], sho
 
 def _light(lighting: Lighting | None, axes: np.ndarray) -> dict[str, Any]:
     """Return the initial light of the page: the file's headlight, else its first light, or none, of `MATTE` matter."""
-    lighting = MATTE if lighting is not None and lighting.sky else lighting  # the page's rays know no sky
+    lighting = MATTE if lighting is not None and lighting.sky else lighting
     one = lighting or MATTE
     kind = "none" if lighting is None else "headlight" if one.headlight else "direction"
     toward = np.array(one.directions[0] if one.directions else (-0.5, -0.7, 0.5)) @ axes
