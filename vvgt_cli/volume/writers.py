@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import io
 import itertools
 import math
 import os
@@ -97,9 +98,9 @@ def _kind(planes: Planes) -> str:
 def _nifti(planes: Planes, name: str) -> tuple[bytes, bytes]:
     nib, grid = need("nibabel", "neuro", name, "a NIfTI file"), planes.grid
     placed = grid if grid.space is None else in_space(grid, "RAS")
-    many = planes.components > 1 or max(grid.dims) > 32767
-    header = nib.Nifti2Header() if max(grid.dims) > 32767 else nib.Nifti1Header()
-    header.set_data_shape((*grid.dims, 1, planes.components) if many else grid.dims)
+    large = max(grid.dims) > 32767
+    header = nib.Nifti2Header() if large else nib.Nifti1Header()
+    header.set_data_shape((*grid.dims, 1, planes.components) if planes.components > 1 or large else grid.dims)
     header.set_data_dtype(planes.dtype)
     header["pixdim"][1:4] = grid.spacing
     header.set_sform(placed.affine, 1 if grid.space else 2)
@@ -107,10 +108,9 @@ def _nifti(planes: Planes, name: str) -> tuple[bytes, bytes]:
     header.set_xyzt_units(unit)
     if planes.components > 1:
         header.set_intent("vector")
-    head = header.binaryblock
-    header["vox_offset"] = len(head) + 4
-    header["magic"] = b"n+1" if len(head) == 348 else header["magic"]
-    return header.binaryblock + bytes(4), b""
+    stream = io.BytesIO()
+    header.write_to(stream)
+    return stream.getvalue(), b""
 
 
 def _nrrd(planes: Planes, _: str) -> tuple[bytes, bytes]:
@@ -145,8 +145,6 @@ def _vti(planes: Planes, _: str) -> tuple[bytes, bytes]:
 
 
 def _npy(planes: Planes, _: str) -> tuple[bytes, bytes]:
-    import io
-
     shape = planes.grid.dims[::-1] + ((planes.components,) if planes.components > 1 else ())
     head, stream = {"descr": planes.dtype.newbyteorder("<").str, "fortran_order": False, "shape": shape}, io.BytesIO()
     np.lib.format.write_array_header_1_0(stream, head)
