@@ -204,7 +204,7 @@ def darkened(g):
     ("page", "text"),
     [
         ("README.md", "(the default, {} steps)"), ("docs/python.md", "1080 px and {} steps"),
-        ("docs/optimize.md", "Then follow {} steps"), ("docs/scale.md", "`--steps` ({})"),
+        ("docs/optimize.md", "Then follow {} steps"), ("docs/blocks.md", "`--steps` ({})"),
         ("docs/commands/convert.md", "takes [{} steps]"),
     ],
 )  # fmt: skip

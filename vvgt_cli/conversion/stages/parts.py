@@ -72,7 +72,7 @@ class OutOfCore(Stage):
         run, field = work.run, work.field
         assert isinstance(field, Blocked)
         if self.together and self.steps:
-            run.console.message(f"more than {MANY:,} Gaussians: refined part by part (docs/scale.md)")
+            run.console.message(f"more than {MANY:,} Gaussians: refined part by part (docs/blocks.md)")
         if self.alone:
             field.views.expect(scored_views(work.fit.screen))
         make_blocks(work, field)
