@@ -203,7 +203,7 @@ def darkened(g):
 @pytest.mark.parametrize(
     ("page", "text"),
     [
-        ("README.md", "(the default, {} steps)"), ("docs/python.md", "1080 px and {} steps"),
+        ("README.md", "16 s ({} steps)"), ("docs/python.md", "1080 px and {} steps"),
         ("docs/optimize.md", "Then follow {} steps"), ("docs/blocks.md", "`--steps` ({})"),
         ("docs/commands/convert.md", "takes [{} steps]"),
     ],
