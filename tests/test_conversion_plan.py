@@ -367,7 +367,7 @@ def test_the_default_refines_and_reports_what_it_skipped(tmp_path, monkeypatch):
     monkeypatch.setattr("vvgt_cli.refine.loop.UNSEEN", 1.0)
     early = done(tmp_path, overwrite=True)
     assert (early.refinement["steps"], early.refinement["views"]) == (EARLY, 48)
-    assert f"{EARLY} steps, no difference is seen" in next(s.note for s in early.stages if s.name == "refinement")
+    assert f"{EARLY} steps, more would hardly be seen" in next(s.note for s in early.stages if s.name == "refinement")
     assert done(tmp_path, replace(SMALL, steps=STEPS), overwrite=True).refinement["steps"] == STEPS
     assert "back-projection" not in names(report)
     assert [name for name, _ in report.skipped] == ["network", "back-projection"]

@@ -66,12 +66,12 @@ def test_an_interrupted_run_ends_as_a_whole_one(method, count, tmp_path):
     assert again.means.tobytes() == whole.means.tobytes()
 
 
-@pytest.mark.parametrize(("unseen", "steps"), [(1.0, 14), (0.0, 30)])
-def test_a_run_ends_early_where_no_difference_is_seen(unseen, steps, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("unseen", "steps", "reason"), [(1.0, 14, "unseen"), (0.0, 30, "steps")])
+def test_a_run_ends_early_where_no_difference_is_seen(unseen, steps, reason, tmp_path, monkeypatch):
     """Else all views are drawn; interrupted before and after the decision, it ends alike."""
     monkeypatch.setattr("vvgt_cli.refine.loop.UNSEEN", unseen)
     whole, expected = run(early=14, first=3)
-    assert (expected.steps, expected.reason) == (steps, "steps")
+    assert (expected.steps, expected.reason) == (steps, reason)
     assert 0 < expected.difference < 1
     assert np.isfinite(whole.means).all()
     path = tmp_path / "run.npz"

@@ -163,7 +163,7 @@ def _expected(options: OptimizeOptions, steps: int, elapsed: float) -> int:
 def _reason(options: OptimizeOptions, checks: Checks, elapsed: float, stop: Callable[[], bool] | None) -> str | None:
     """Return why to stop before the next step; None to go on."""
     if options.steps is not None and checks.record.steps >= options.steps:
-        return "steps"
+        return "unseen" if checks.record.steps == options.early else "steps"
     if options.time_budget is not None and elapsed >= options.time_budget:
         return "time"
     if options.target_psnr is not None and checks.best is not None and checks.best >= options.target_psnr:

@@ -102,7 +102,7 @@ class OptimizeRecord:
     Attributes:
         steps: taken, and ``kept``: the step whose Gaussians were returned (0: the input).
         seconds: wall time.
-        reason: why it ended: "steps", "time", "target", "no gain", "interrupted".
+        reason: why it ended: "steps", "unseen" (an early end), "time", "target", "no gain", "interrupted".
         psnr_before, psnr_after: dB on the check views; None without any.
         difference: that of the check views halfway to an early end (`visible_difference`); None without one.
         checks: (step, seconds, dB) of each score on the check views.

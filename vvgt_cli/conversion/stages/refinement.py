@@ -28,8 +28,8 @@ CHECK_EVERY = 25  # steps between checks where a target ends the run; else one c
 SMALLEST = 0.5  # standard deviation of the longest axis, in screen pixels, below which viewers drop or fade splats
 MIN_KEPT = 0.99  # share of the Gaussians that usually remain where small ones are widened
 REASONS = {
-    "steps": "", "time": "time is up", "target": "target reached", "no gain": "ended early: no more gain",
-    "interrupted": "interrupted",
+    "steps": "", "unseen": "more would hardly be seen", "time": "time is up", "target": "target reached",
+    "no gain": "ended early: no more gain", "interrupted": "interrupted",
 }  # fmt: skip
 
 
@@ -183,8 +183,6 @@ def _on_its_device(
 
 def _note(record: OptimizeRecord, options: OptimizeOptions) -> str:
     notes = [f"{record.steps} steps" + f" ({options.method})" * (options.method != METHOD)]
-    if record.steps == options.early:
-        notes.append("no difference is seen")
     if 0 < record.kept < record.steps:
         notes.append(f"best after {record.kept}")
     if REASONS[record.reason]:
