@@ -1,11 +1,11 @@
-# make test | quick | lint | formats | docs | dist | long | mutants | viewers | page | model | ci
+# make test | quick | lint | formats | docs | dist | bundle | figures | long | mutants | viewers | page | model | ci
 VENV ?= .venv-test
 PYTHON ?= python3
 BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 # CONSTRAINTS= installs the newest releases: for systems that the pins have no wheels for
 CONSTRAINTS ?= -c constraints.txt
 
-.PHONY: test quick lint format formats docs dist long fuzz mutants viewers page model ci
+.PHONY: test quick lint format formats docs dist bundle figures long fuzz mutants viewers page model ci
 
 $(BIN)/pytest: pyproject.toml constraints.txt
 	[ -x $(BIN)/python ] || $(PYTHON) -m venv $(VENV)
@@ -44,6 +44,16 @@ docs: $(BIN)/pytest
 # Wheel and sdist in dist/, built, checked, and each tried in an environment of its own.
 dist:
 	PYTHON="$(PYTHON)" CONSTRAINTS="$(CONSTRAINTS)" .ci/dist dist
+
+# Everything that a cluster without a network needs, in one file in dist/ (docs/cluster.md): make bundle EXTRAS=cluster,hdf5
+bundle:
+	PYTHON="$(PYTHON)" CONSTRAINTS="$(CONSTRAINTS)" packaging/bundle.sh dist "$(EXTRAS)"
+
+# The README's table, measured on this machine in about half an hour; SCENES, DATA and FUNCTIONS: docs/data.md. OUT keeps
+# all figures: make figures SCENES=scenes.tsv DATA=data FUNCTIONS=tf
+OUT ?= out/figures
+figures: $(BIN)/pytest
+	PYTHON="$(CURDIR)/$(BIN)/python" benchmarks/figures.sh "$(SCENES)" "$(DATA)" "$(FUNCTIONS)" "$(OUT)"
 
 # The checks that take too long for every change: tests marked `long`, and property tests with 10,000 examples.
 long: $(BIN)/pytest

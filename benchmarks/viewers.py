@@ -65,13 +65,13 @@ VIEWERS = {
     "spark": Viewer("Spark", "@sparkjsdev/spark", "spark", (".v4.spz", ".glb")),
     "three": Viewer("three.js", "three", "three", (".compressed.ply", ".sog"), "stored"),
     "babylon": Viewer("Babylon.js", "babylonjs", "babylon"),
-    "cesium": Viewer("CesiumJS, in a tile", "cesium", "cesium", (".ply", ".compressed.ply", ".sog", ".glb")),
+    "cesium": Viewer("CesiumJS, in a tile", "cesium", "cesium", (".ply", ".compressed.ply", ".v4.spz", ".sog", ".glb")),
     "splats3d": Viewer(
         "GaussianSplats3D", "@mkkellogg/gaussian-splats-3d", "viser", (".spz", ".v4.spz", ".sog", ".glb")
     ),
     "gsplatjs": Viewer("gsplat.js", "gsplat", "viser", tuple(set(FORMATS) - {".ply"})),
 }
-NOT_RUN = "Blender 5.3, RealityKit, Scaniverse; Omniverse and Houdini, for `.usdc` and `.usdz`"
+NOT_RUN = "RealityKit, Scaniverse, Unity, Unreal; Omniverse and Houdini, for `.usdc` and `.usdz`"
 
 
 Row = tuple[float, str] | None  # dB of a viewer's picture against our drawing, side of highlights; None: it fails

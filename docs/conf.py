@@ -28,7 +28,7 @@ from vvgt_cli.version import VERSION  # noqa: E402
 project = html_title = "vvgt"
 version = release = VERSION
 root_doc = "docs/index"
-include_patterns = ["*.md", "docs/**.md", "examples/*.md", "models/*.md"]
+include_patterns = ["*.md", "docs/**.md", "examples/*.md", "models/*.md", "packaging/*.md"]
 exclude_patterns = [
     ".*",
     "CODE_OF_CONDUCT.md",

@@ -33,16 +33,23 @@ def picture(scene: Any, name: str, samples: int) -> None:
 
 def points(item: Any) -> dict[str, Any]:
     """Places in the world (float64), and the attributes."""
-    mesh, found = item.data, {}
-    places = np.empty(3 * len(mesh.vertices), np.float32)
-    mesh.vertices.foreach_get("co", places)
+    attributes, found = item.data.attributes, {}
     matrix = np.array(item.matrix_world)
-    found["places"] = places.reshape(-1, 3).astype(float) @ matrix[:3, :3].T + matrix[:3, 3]
-    for key, field, width in (("color", "color", 4), ("opacity", "value", 1)):
-        values = np.empty(width * len(mesh.vertices), np.float32)
-        mesh.attributes[key].data.foreach_get(field, values)
-        found[key] = values.reshape(-1, width)
-    return found
+    found["places"] = values(attributes["position"], "vector", 3).astype(float) @ matrix[:3, :3].T + matrix[:3, 3]
+    if item.type == "POINTCLOUD":  # Blender's own splats: display colour of degree 0, and opacity
+        base = values(attributes["radiance:base"], "vector", 4)
+        display = 0.5 + 0.28209479177387814 * base[:, :3]
+        linear = np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
+        return found | {"color": linear, "opacity": base[:, 3:]}
+    return found | {key: values(attributes[key], *how) for key, how in
+                    {"color": ("color", 4), "opacity": ("value", 1)}.items()}  # fmt: skip
+
+
+def values(attribute: Any, field: str, width: int) -> np.ndarray:
+    """(K, width) float32."""
+    found = np.empty(width * len(attribute.data), np.float32)
+    attribute.data.foreach_get(field, found)
+    return found.reshape(-1, width)
 
 
 def ramp(item: Any, nodes: list[tuple[float, tuple[float, ...]]], strength: float) -> None:
@@ -85,7 +92,7 @@ def main() -> None:
     scene.render.engine, scene.render.film_transparent, scene.render.dither_intensity = "CYCLES", True, 0
     scene.render.resolution_x = scene.render.resolution_y = SIZE
     scene.render.threads_mode, scene.render.threads = "FIXED", 1
-    scene.cycles.pixel_filter_type = "BOX"
+    scene.cycles.pixel_filter_type, scene.cycles.use_denoising = "BOX", False
     views = json.loads((FOLDER / "views.json").read_text())
     for name, view in views.items():
         bpy.ops.import_scene.gaussian_splats(filepath=str(FOLDER / name))

@@ -8,7 +8,7 @@ from tests.processes import replaced
 from tests.spared import spare
 from vvgt_cli.commands.main import run
 
-SIZES = {"convert": "--max-gaussians 200 --size 48", "init": "--max-gaussians 200", "render": "--size 48"}
+SIZES = {"convert": "--max-gaussians 200 --screen 48", "init": "--max-gaussians 200", "render": "--size 48"}
 SIZES |= {"render-views": "--views 8 --test-views 2 --size 32", "evaluate": "--screen 48 --no-conditions --step 1"}
 SIZES |= {"optimize": "--steps 4", "report": "--max-gaussians 200 --screen 48 --steps 2"}
 OWN_BUDGET = {"--target-psnr", "--time-budget", "--dry-run", "--live"}

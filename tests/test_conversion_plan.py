@@ -17,7 +17,7 @@ from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
 from vvgt_cli.conversion.stages import BackProjection, Network, Refinement, TrainingViews
 from vvgt_cli.conversion.stages.refinement import WIDER
 from vvgt_cli.conversion.stages.views import view_count
-from vvgt_cli.defaults import MAX_STEPS, STEPS
+from vvgt_cli.defaults import EARLY, MAX_STEPS, STEPS
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.field.workload import Workload
@@ -115,7 +115,7 @@ def test_views_are_small_where_gaussians_are_wide(size, edge):
 def test_refinement_on_small_views_gains_on_whole_ones(tmp_path):
     report = done(tmp_path, FitOptions(600, 128))
     stages = {stage.name: stage for stage in report.stages}
-    assert stages["views"].note.startswith("96 of 64 px to fit to")
+    assert stages["views"].note.startswith("48 of 64 px (96 where descent goes on) to fit to")
     assert stages["refinement"].kept
     assert stages["refinement"].psnr > stages["refinement"].psnr_before + 1
     assert chosen(report)["small"]
@@ -203,8 +203,8 @@ def darkened(g):
 @pytest.mark.parametrize(
     ("page", "text"),
     [
-        ("README.md", "(the default, {} steps)"), ("docs/python.md", "1080 px and {} steps"),
-        ("docs/optimize.md", "Then follow {} steps"), ("docs/scale.md", "`--steps` ({})"),
+        ("README.md", "16 s ({} steps)"), ("docs/python.md", "1080 px and {} steps"),
+        ("docs/optimize.md", "Then follow {} steps"), ("docs/blocks.md", "`--steps` ({})"),
         ("docs/commands/convert.md", "takes [{} steps]"),
     ],
 )  # fmt: skip
@@ -248,7 +248,7 @@ def test_a_network_runs_where_there_is_time_for_it():
 def test_views_are_fitted_to_at_their_size_and_judged_at_the_screens(tmp_path, monkeypatch):
     asked = []
 
-    def refine(run, gaussians, train, check, options, begin=None):
+    def refine(run, gaussians, train, check, options, begin=None, later=None):
         asked.append((options.rule, options.check_rule, options.texture, gaussians, begin))
         return gaussians
 
@@ -359,9 +359,16 @@ def test_a_dry_run_plans_and_writes_nothing(tmp_path):
     refused(UsageError, "exists", plan_of, request, Console(quiet=True))
 
 
-def test_the_default_refines_and_reports_what_it_skipped(tmp_path):
+def test_the_default_refines_and_reports_what_it_skipped(tmp_path, monkeypatch):
+    monkeypatch.setattr("vvgt_cli.refine.loop.UNSEEN", 0.0)
     report = done(tmp_path)
     assert report.refinement["steps"] == STEPS
+    assert report.refinement["views"] == 120
+    monkeypatch.setattr("vvgt_cli.refine.loop.UNSEEN", 1.0)
+    early = done(tmp_path, overwrite=True)
+    assert (early.refinement["steps"], early.refinement["views"]) == (EARLY, 48)
+    assert f"{EARLY} steps, more would hardly be seen" in next(s.note for s in early.stages if s.name == "refinement")
+    assert done(tmp_path, replace(SMALL, steps=STEPS), overwrite=True).refinement["steps"] == STEPS
     assert "back-projection" not in names(report)
     assert [name for name, _ in report.skipped] == ["network", "back-projection"]
     assert np.isfinite(report.scores["psnr"])

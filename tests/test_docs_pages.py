@@ -16,7 +16,8 @@ from vvgt_cli.version import VERSION
 
 ROOT = Path(__file__).parent.parent
 SITE = runpy.run_path(str(ROOT / "docs" / "conf.py"))
-PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *ROOT.glob("examples/*.md")])
+FOLDERS = [ROOT / "examples", ROOT / "packaging"]
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(p for f in FOLDERS for p in f.glob("*.md"))])
 
 
 def commands():
@@ -149,6 +150,31 @@ def test_constraints_pin_every_dependency_of_the_package():
     wanted = project["dependencies"] + extras["test"] + extras["docs"]
     for requirement in wanted:
         assert re.sub(r"[-_.]+", "-", re.match(r"[\w.-]+", requirement)[0]).lower() in names, requirement
+
+
+def test_recipes_state_the_version_and_dependencies_of_the_package():
+    import tomllib
+
+    import yaml
+
+    requirements = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+    wanted = dict(re.match(r"([\w-]+)([^;]*)", requirement).groups() for requirement in requirements)
+    recipe = yaml.safe_load((ROOT / "packaging" / "conda" / "recipe.yaml").read_text())
+    assert recipe["context"]["version"] == VERSION
+    run = dict(line.split(" ") for line in recipe["requirements"]["run"])
+    other = {"openexr-python": "OpenEXR", "py-openimageio": "OpenImageIO"}
+    assert {other.get(name, name): version for name, version in run.items()} == wanted | {"python": ">=3.11"}
+
+    spack = (ROOT / "packaging" / "spack" / "package.py").read_text()
+    assert re.findall(r'(?:version\("|vvgt@)([\d.]+)', spack) == [VERSION, VERSION]
+    found = dict(re.findall(r'depends_on\("py-([\w-]+)@([\d.:]+)", type=\("build", "run"\)', spack))
+    wheels = dict(re.match(r"([\w-]+)(.*)", text).groups() for text in re.findall(r'"(\w+>=[\d.]+)"', spack))
+    ranges = {name: ">=" + text.rstrip(":").replace(":0.68", ",<0.69") for name, text in found.items()}
+    assert ranges | wheels == wanted
+
+    docker = [*re.findall(r"^RUN (.*)$", (ROOT / "packaging" / "Dockerfile").read_text(), re.M)]
+    post = (ROOT / "packaging" / "vvgt.def").read_text().partition("%post\n")[2].partition("\n\n")[0]
+    assert docker[:3] == [line.strip() for line in post.splitlines()][1:]
 
 
 def test_pictures_of_the_gallery_are_small_and_shown():

@@ -7,7 +7,7 @@ import pytest
 
 from tests.refused import refused
 from vvgt_cli.errors import DataError
-from vvgt_cli.images.metrics import CAP, flip, psnr, separable, ssim
+from vvgt_cli.images.metrics import CAP, flip, psnr, separable, ssim, visible_difference
 
 
 def picture(height=70, width=90, seed=0):
@@ -22,6 +22,25 @@ def picture(height=70, width=90, seed=0):
 
 def noisy(image, sigma, seed=1):
     return np.clip(image + np.random.default_rng(seed).normal(0, sigma, image.shape), 0, 1)
+
+
+def test_a_difference_is_seen_in_matter_and_by_weight():
+    """One pixel in fifty differs by 0.5, those beside matter by more."""
+    reference = np.zeros((20, 10, 4), np.float32)
+    reference[:10] = 0.5, 0.5, 0.5, 1
+    ours = reference.copy()
+    ours[:10:5, ::10, 1] = 0.0
+    ours[10:, :, :3] = 1.0
+    assert visible_difference([reference], [ours]) == 0.5
+    ours[0, 0] = reference[0, 0]
+    assert visible_difference([reference], [ours]) < 0.01
+    ours[10:, :, 3] = 0.5  # matter where there is none
+    assert visible_difference([reference], [ours]) == 1.0
+    weights = np.ones((20, 10), np.float32)
+    weights[10:] = 0.4
+    assert visible_difference([reference], [ours], [weights]) < 0.01
+    assert visible_difference([reference[10:]], [np.full((10, 10, 4), 7.0)]) == 1.0  # beyond what a screen shows
+    assert visible_difference([0 * reference], [0 * reference]) == 0.0
 
 
 @pytest.mark.parametrize("shape", [(21, 21), (64, 65), (130, 40), (200, 129)])

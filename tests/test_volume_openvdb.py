@@ -171,7 +171,7 @@ def test_the_only_grid_needs_no_name(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("at", "value", "message"),
     [
-        (8, struct.pack("<I", 221), "format version 221; expected 222 to 224"),
+        (8, struct.pack("<I", 221), "format version 221; expected 222 to 225"),
         (20, b"\0", "written as an OpenVDB stream"),
         (0, b"x", "named like a OpenVDB file, but its content is of no known format"),
     ],
@@ -181,6 +181,16 @@ def test_damaged_headers(folder: Path, tmp_path: Path, at: int, value: bytes, me
     data[at : at + len(value)] = value
     (tmp_path / "v.vdb").write_bytes(data)
     refused(DataError, message, read_volume, str(tmp_path / "v.vdb"), ReadOptions(array="float"))
+
+
+def test_version_225_adds_a_type_of_grid_only(folder: Path, tmp_path: Path) -> None:
+    data = bytearray((folder / "sphere.vdb").read_bytes())
+    data[8:12] = struct.pack("<I", 225)
+    (tmp_path / "v.vdb").write_bytes(data)
+    found, known = (
+        read_volume(str(path), ReadOptions(array="fog")) for path in (tmp_path / "v.vdb", folder / "sphere.vdb")
+    )
+    np.testing.assert_array_equal(np.asarray(found.data), np.asarray(known.data))
 
 
 def test_a_file_that_was_cut(folder: Path, tmp_path: Path) -> None:

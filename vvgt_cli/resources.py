@@ -6,6 +6,7 @@ import ctypes
 import math
 import os
 import re
+import signal
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -205,3 +206,12 @@ def _groups(controller: str) -> Iterator[Group]:
         inside = own_path.relative_to(root) if own_path.is_relative_to(root) else Path()
         folder = place / inside
         yield from (Group(each) for each in (folder, *folder.parents) if each.is_relative_to(place))
+
+
+def kill_group(process: Any) -> None:
+    """Kill a `subprocess.Popen` that began a session, with all that it started; on Windows it alone."""
+    with suppress(OSError):
+        if hasattr(os, "killpg"):
+            os.killpg(process.pid, signal.SIGKILL)
+        else:
+            process.kill()

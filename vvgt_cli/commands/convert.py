@@ -8,7 +8,7 @@ import click
 
 from vvgt_cli.commands import options as shared
 from vvgt_cli.commands.words import ASIDE, command_line
-from vvgt_cli.defaults import INIT, MAX_STEPS, RULE, STEPS
+from vvgt_cli.defaults import EARLY, INIT, MAX_STEPS, RULE, STEPS
 
 if TYPE_CHECKING:
     from vvgt_cli.conversion.clouds import Clouds
@@ -140,8 +140,8 @@ def convert(
 @shared.rule_option(f"Viewer to optimise for, by how it draws a Gaussian. Default: {RULE}.")
 @click.option(
     "--steps", type=click.IntRange(0, 10_000_000), metavar="N",
-    help=f"Maximum number of gradient descent steps; 0 for none. Default: {STEPS}, or up to {MAX_STEPS} with a target "
-    "or time budget.",
+    help=f"Maximum number of gradient descent steps; 0 for none. Default: {STEPS}, {EARLY} where more would hardly be "
+    f"seen, or up to {MAX_STEPS} with a target or time budget.",
 )  # fmt: skip
 @click.option(
     "--live", is_flag=True,

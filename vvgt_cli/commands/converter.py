@@ -11,7 +11,6 @@ import atexit
 import os
 import pickle
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -26,7 +25,7 @@ from vvgt_cli.errors import DataError, VvgtError
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians.formats.page_values import Values
 from vvgt_cli.look import LabelTable, LightOptions, TransferFunction
-from vvgt_cli.resources import memory_limit
+from vvgt_cli.resources import kill_group, memory_limit
 
 
 @dataclass(frozen=True)
@@ -188,11 +187,7 @@ class Converter:
         process, self._process, self._busy, self._scoring = self._process, None, False, False
         if process is None:
             return
-        with suppress(OSError):
-            if hasattr(os, "killpg"):
-                os.killpg(process.pid, signal.SIGKILL)
-            else:
-                process.kill()
+        kill_group(process)
         process.wait()
         for name in os.listdir(cast(str, self._folder)):
             shutil.rmtree(os.path.join(cast(str, self._folder), name), ignore_errors=True)

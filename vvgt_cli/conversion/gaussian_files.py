@@ -123,7 +123,7 @@ def write_gaussians(
             report.bytes = write_ply(sys.stdout.buffer, gaussians, options, normals)
             sys.stdout.buffer.flush()
         else:
-            report.bytes = _write_file(output, gaussians, options, overwrite, normals, values)
+            report.bytes = write_file(output, gaussians, options, overwrite, normals, values)
         report.gaussians = len(gaussians)
         record.note = f"{output}: {len(gaussians)} Gaussians, {report.bytes / 1e6:.1f} MB{more}"
     if is_page(output) and not more:
@@ -204,7 +204,7 @@ def write_page(
         )
 
 
-def _write_file(
+def write_file(
     output: str, gaussians: Gaussians, options: PlyOptions, overwrite: bool, normals: np.ndarray | None,
     values: Values | None,
 ) -> int:  # fmt: skip

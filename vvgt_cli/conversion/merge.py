@@ -40,7 +40,7 @@ def write_shard(request: ConvertRequest, console: Console | None = None) -> Conv
     if request.output in (None, STDOUT) or request.report or levels or not request.out_of_core:
         raise UsageError(
             "--shard: expected a folder of blocks as -o, no --report and no --init; 'vvgt merge' makes the .ply or "
-            "lod-meta.json (docs/scale.md)"
+            "lod-meta.json (docs/cluster.md)"
         )
     try:
         with open_field(run, request) as field:

@@ -47,6 +47,7 @@ class Refiner:
         reader, light: see `vvgt_cli.field.cells.CellBlocks`.
         fit: options of the descent.
         limits: target PSNR on a part's own weighted check views, at which its descent ends.
+        early: steps after which a part's descent may end (`early_end`).
         distances: distance from which each level is seen, unit frame.
     """
 
@@ -54,6 +55,7 @@ class Refiner:
     light: Light | None
     fit: FitOptions
     limits: Limits
+    early: int | None = None
     distances: tuple[float, ...] = (RADIUS,)
 
 
@@ -248,12 +250,14 @@ def refine_part(part: VolumePart, gaussians: Gaussians, refiner: Refiner, distan
     CheckViews(edge=edge).run(work)
     if work.target_reached():
         return gaussians
-    TrainingViews(view_count(steps, small=True), edge).run(work)
+    early = None if refiner.early is None or refiner.early >= steps else refiner.early
+    first = None if early is None else view_count(early, small=True)
+    TrainingViews(view_count(steps, small=True), edge, first=first).run(work)
     if fit.model is not None:
         Network(fit.model).run(work)
     better = work.gaussians is not start
     if steps:
-        Refinement(steps, steps, small=True, overlap=True).run(work)
+        Refinement(steps, steps, small=True, early=early, overlap=True).run(work)
         assert run.report.refinement is not None
         better |= bool(run.report.refinement["kept"])
     return as_stored(part.moved_out(work.current())) if better else gaussians

@@ -21,7 +21,7 @@ from vvgt_cli.conversion.stages import (
     ViewingConditions,
 )
 from vvgt_cli.conversion.stages.parts import OutOfCore
-from vvgt_cli.conversion.stages.refinement import most_steps, steps_in_time
+from vvgt_cli.conversion.stages.refinement import early_end, most_steps, steps_in_time
 from vvgt_cli.conversion.stages.views import view_count
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.field import ViewRenderer
@@ -197,12 +197,17 @@ class Planner:
     def _descent(self, steps: int, small: bool, most: int) -> list[Stage]:
         """Return gradient descent with its views, and cells by error unless steps are few or a network runs."""
         enough = steps >= ENOUGH_STEPS and self.fit.init == "moments"  # else no pyramid can be cut again
+        early = early_end(self.fit, self.limits)
+        early = None if early is None or early >= steps else early
         return [
             CheckViews(),
-            TrainingViews(view_count(steps, small), view_edge(self.fit.screen, small)),
+            TrainingViews(
+                view_count(steps, small), view_edge(self.fit.screen, small),
+                first=None if early is None else view_count(early, small),
+            ),
             *([CellsByError(small, keep=not self._recuts())] if enough and self.fit.model is None else []),
-            Refinement(steps, most, small, overlap=enough),
-        ]
+            Refinement(steps, most, small, early, overlap=enough),
+        ]  # fmt: skip
 
     def _recuts(self) -> bool:
         """Return whether the pyramid may be cut again, for fewer Gaussians."""

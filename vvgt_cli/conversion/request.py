@@ -91,6 +91,11 @@ class Limits:
         if self.max_megabytes is not None and not 0 < self.max_megabytes < math.inf:
             raise UsageError(f"--max-megabytes {self.max_megabytes:g}: expected more than 0 MB")
 
+    @property
+    def ended(self) -> bool:
+        """Return whether a target or a time budget ends descent."""
+        return self.target_psnr is not None or self.time_budget is not None
+
     def gaussians(self, most: int, header: float, each: float) -> int:
         """Return how many Gaussians of ``each`` bytes budget and file size allow after a header.
 

@@ -12,10 +12,10 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.sets import SIZE
+from vvgt_cli.conversion.gaussian_files import write_file
 from vvgt_cli.conversion.place import AUTO, NONE, preview, to_box_frame, up_axis, upright_axes
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.files import atomic_write
-from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
+from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats import SUFFIXES, encoded, format_of
 from vvgt_cli.gaussians.formats.page_file import iframe
 from vvgt_cli.gaussians.formats.page_values import Layer, Values
@@ -112,11 +112,8 @@ class Result:
             if not page:
                 raise UsageError(f"{os.fspath(path)}: only pages show stories; expected .html, or no story")
             ply = replace(ply, story=read_story(story).checked(self.page_layers() if values and ply.comments else ()))
-        with atomic_write(path, overwrite) as temporary:
-            if known is None:
-                return write_ply(temporary, self.gaussians, ply, self.normals())
-            held = self.values() if values and page and ply.comments else None
-            return temporary.write_bytes(encoded(known, self.gaussians, ply, os.fspath(path), held))
+        held = self.values() if values and page and ply.comments else None
+        return write_file(os.fspath(path), self.gaussians, ply, overwrite, None if known else self.normals(), held)
 
     def layout(
         self, frame: str | None = None, up: str | None = None, sh_degree: int | None = None,

@@ -222,11 +222,8 @@ def values_error(header: FileFacts, gaussians: Gaussians, volume: Volume) -> tup
         part = read_block(volume, np.array([0, 0, z]), np.array([nx, ny, z + len(slab)]))
         wrong = np.abs(part.astype(np.float64) * volume.slope + volume.intercept - slab)
         wrong, z = wrong[np.isfinite(wrong)], z + len(slab)
-        squares, count, largest = (
-            squares + float((wrong**2).sum()),
-            count + wrong.size,
-            max(largest, wrong.max(initial=0)),
-        )
+        squares, count = squares + float((wrong**2).sum()), count + wrong.size
+        largest = max(largest, wrong.max(initial=0))
     if not count or facts.hi <= facts.lo:
         return None
     rms = math.sqrt(squares / count) / (facts.hi - facts.lo)

@@ -53,7 +53,7 @@ class BlockOptions:
 def worker_count(options: BlockOptions, voxels: int, gaussians: int, threads: int, block: int = 0) -> int:
     """Return the number of processes: as many as threads where there is much to do and memory for each.
 
-    Processes on blocks of their own are quicker than threads within each kernel (docs/scale.md). ``block`` is the
+    Processes on blocks of their own are quicker than threads within each kernel (docs/cluster.md). ``block`` is the
     number of bytes of the smallest block.
     """
     if options.workers is not None or options.scheduler is not None or options.shard is not None:

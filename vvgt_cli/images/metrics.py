@@ -70,6 +70,28 @@ def mean_psnr(
     return float(np.average([psnr(a[..., :3], b[..., :3]) for a, b in weighted], weights=shares))
 
 
+def visible_difference(
+    references: Sequence[np.ndarray], ours: Sequence[np.ndarray], weights: Sequence[np.ndarray] | None = None
+) -> float:
+    """Return the difference of sRGB values, 0 to 1, that 99 % of the pixels with matter do not exceed in any channel.
+
+    It orders pictures as the 99th percentile of FLIP there (docs/log/steps.md), and needs no whole pictures.
+
+    Args:
+        references: pictures of the volume, (h, w, 4) premultiplied over black.
+        ours: pictures to compare.
+        weights: (h, w) factors of the differences in each picture; pixels below 0.5 do not count.
+    """
+    found = []
+    for i, (a, b) in enumerate(zip(references, ours, strict=True)):
+        matter = np.maximum(a[..., 3], b[..., 3]) > FOREGROUND
+        if weights is not None:
+            matter &= weights[i] > 0.5
+        found.append(np.abs(a[..., :3] - np.clip(b[..., :3], 0, 1)).max(axis=-1)[matter])
+    differences = np.concatenate(found)
+    return float(np.quantile(differences, 0.99)) if len(differences) else 0.0
+
+
 def ssim(reference: np.ndarray, ours: np.ndarray) -> float:
     """Return the mean SSIM of RGB images in [0, 1]: 11 x 11 Gaussian window, sigma 1.5, data range 1.
 

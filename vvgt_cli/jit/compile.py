@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import pickle
-import signal
 import subprocess
 import sys
 from collections.abc import Iterable, Sequence
@@ -19,6 +18,7 @@ import numba
 from vvgt_cli.jit.numba_internals import config
 from vvgt_cli.jit.store import PACKAGE, folder_for_writing, folders, warn_once
 from vvgt_cli.progress import ProgressCallback
+from vvgt_cli.resources import kill_group
 
 VOLUMES = ("uint8", "uint16", "float32")  # types of a volume's values that kernels read
 
@@ -113,7 +113,7 @@ def compile_in_subprocess(jobs: Sequence[CompileJob], progress: ProgressCallback
         return _follow(process, pickle.dumps((folder, list(jobs))), len(jobs), progress)
     finally:
         if process.poll() is None:
-            _kill(process)
+            kill_group(process)
         process.wait()
 
 
@@ -126,15 +126,6 @@ def _follow(process: Any, order: bytes, count: int, progress: ProgressCallback |
         if progress:
             progress(done, count)
     return bool(process.wait() == 0)
-
-
-def _kill(process: Any) -> None:
-    """End a worker and its forks."""
-    with contextlib.suppress(OSError):
-        if hasattr(os, "killpg"):
-            os.killpg(process.pid, signal.SIGKILL)
-        else:
-            process.kill()
 
 
 def compile_ahead(names: Iterable[str], progress: ProgressCallback | None = None) -> tuple[int, int, Path | None]:

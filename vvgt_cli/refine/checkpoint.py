@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import struct
 import zipfile
 from dataclasses import asdict, replace
@@ -19,7 +20,7 @@ from vvgt_cli.cameras.blocks import picked
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import INRIA, Gaussians, Rule
-from vvgt_cli.images.metrics import mean_psnr
+from vvgt_cli.images.metrics import mean_psnr, visible_difference
 from vvgt_cli.refine.options import Check, OptimizeOptions, OptimizeRecord
 
 if TYPE_CHECKING:
@@ -45,6 +46,7 @@ class Checks:
         self.best: float | None = None
         self.kept: dict[str, np.ndarray] | None = None  # of what the state has saved, its arrays
         self.idle = 0
+        self.difference = math.inf  # of the state last scored (`visible_difference`)
 
     def measure(self, seconds: float, settling: bool = False) -> bool:
         """Score the state, unless that has been done; True if it has fallen, and was put back to the best.
@@ -60,7 +62,7 @@ class Checks:
         for i, camera in enumerate(cameras):
             part = None if blocks is None else blocks[i]
             images.append(picked(self.state.picture(camera, self.rule, part), part))
-        now = mean_psnr(views, images, weights)
+        now, self.difference = mean_psnr(views, images, weights), visible_difference(views, images, weights)
         record.checks.append((record.steps, seconds, now))
         fallen = self.best is not None and now < self.best - FALLEN and self.state.STEADY
         gained = self.best is None or now > self.best + GAIN

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -21,6 +21,7 @@ LOSS_3DGS = {"l1": 0.8, "l2": 0.0, "ssim": 0.2, "alpha": 0.0}
 TEXTURE = 6.0  # weight of the term for texture beside that of the squares (docs/log/closed-form.md)
 LOSSES: dict[str, dict[str, float]] = {"axes": {"texture": TEXTURE}, "3dgs": LOSS_3DGS}
 Train: TypeAlias = "tuple[Sequence[Camera], np.ndarray]"
+Later: TypeAlias = "tuple[int, Callable[[], None]]"  # how many of the training views are drawn; draws the others
 Check: TypeAlias = "Train | tuple[Sequence[Camera], np.ndarray, Sequence[Blocks] | None, Sequence[np.ndarray] | None]"
 
 
@@ -44,6 +45,8 @@ class OptimizeOptions:
             for W.
         check_rule: by which the check views are drawn.
         check_every: fewest steps between two scores on the check views, of which a run takes eight or so.
+        early: steps after which the run ends where no difference is seen any more (`UNSEEN`), which is decided halfway
+            there; None: it does not.
         patience: scores in a row without a gain of 0.01 dB, in the second half, after which to stop.
         checkpoint: .npz written every ``check_every`` steps and at the end; where it is there, the run goes on from it.
         seed: of the order of views, and of what "3dgs" draws.
@@ -63,6 +66,7 @@ class OptimizeOptions:
     rule: Rule = INRIA
     check_rule: Rule = INRIA
     check_every: int = 25
+    early: int | None = None
     patience: int = 3
     checkpoint: str | None = None
     seed: int = 0
@@ -98,8 +102,9 @@ class OptimizeRecord:
     Attributes:
         steps: taken, and ``kept``: the step whose Gaussians were returned (0: the input).
         seconds: wall time.
-        reason: why it ended: "steps", "time", "target", "no gain", "interrupted".
+        reason: why it ended: "steps", "unseen" (an early end), "time", "target", "no gain", "interrupted".
         psnr_before, psnr_after: dB on the check views; None without any.
+        difference: that of the check views halfway to an early end (`visible_difference`); None without one.
         checks: (step, seconds, dB) of each score on the check views.
     """
 
@@ -109,4 +114,5 @@ class OptimizeRecord:
     reason: str = "steps"
     psnr_before: float | None = None
     psnr_after: float | None = None
+    difference: float | None = None
     checks: list[tuple[int, float, float]] = field(default_factory=list)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import io
 import itertools
 import math
 import os
@@ -25,8 +26,9 @@ from vvgt_cli.volume.space import in_space
 from vvgt_cli.volume.types import RIGHT, Volume
 
 SUFFIXES = (".nii.gz", ".nii", ".nrrd", ".mha", ".vti", ".npy", ".zarr", ".vdb")
-_META = {"f4": "FLOAT", "u1": "UCHAR", "u2": "USHORT", "i4": "INT"}
-_VTK = {"f4": "Float32", "u1": "UInt8", "u2": "UInt16", "i4": "Int32"}
+_NAMES = {  # of types, in NRRD and in MetaImage
+    "f4": ("float", "FLOAT"), "u1": ("uint8", "UCHAR"), "u2": ("uint16", "USHORT"), "i4": ("int32", "INT"),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -90,16 +92,12 @@ def write_volume(path: str | os.PathLike[str], planes: Planes, overwrite: bool =
         return temporary.stat().st_size
 
 
-def _kind(planes: Planes) -> str:
-    return planes.dtype.str[1:]
-
-
 def _nifti(planes: Planes, name: str) -> tuple[bytes, bytes]:
     nib, grid = need("nibabel", "neuro", name, "a NIfTI file"), planes.grid
     placed = grid if grid.space is None else in_space(grid, "RAS")
-    many = planes.components > 1 or max(grid.dims) > 32767
-    header = nib.Nifti2Header() if max(grid.dims) > 32767 else nib.Nifti1Header()
-    header.set_data_shape((*grid.dims, 1, planes.components) if many else grid.dims)
+    large = max(grid.dims) > 32767
+    header = nib.Nifti2Header() if large else nib.Nifti1Header()
+    header.set_data_shape((*grid.dims, 1, planes.components) if planes.components > 1 or large else grid.dims)
     header.set_data_dtype(planes.dtype)
     header["pixdim"][1:4] = grid.spacing
     header.set_sform(placed.affine, 1 if grid.space else 2)
@@ -107,15 +105,13 @@ def _nifti(planes: Planes, name: str) -> tuple[bytes, bytes]:
     header.set_xyzt_units(unit)
     if planes.components > 1:
         header.set_intent("vector")
-    head = header.binaryblock
-    header["vox_offset"] = len(head) + 4
-    header["magic"] = b"n+1" if len(head) == 348 else header["magic"]
-    return header.binaryblock + bytes(4), b""
+    stream = io.BytesIO()
+    header.write_to(stream)
+    return stream.getvalue(), b""
 
 
 def _nrrd(planes: Planes, _: str) -> tuple[bytes, bytes]:
-    kind = {"f4": "float", "u1": "uint8", "u2": "uint16", "i4": "int32"}[_kind(planes)]
-    return nrrd_header(planes.grid, kind, planes.components), b""
+    return nrrd_header(planes.grid, _NAMES[planes.dtype.str[1:]][0], planes.components), b""
 
 
 def _meta(planes: Planes, _: str) -> tuple[bytes, bytes]:
@@ -125,7 +121,7 @@ def _meta(planes: Planes, _: str) -> tuple[bytes, bytes]:
         "TransformMatrix": _words(grid.axes.T.ravel()), "Offset": _words(grid.origin),
         "AnatomicalOrientation": "RAI" if grid.space else "???", "ElementSpacing": _words(grid.spacing),
         "DistanceUnits": grid.unit or "?", "DimSize": _words(grid.dims), "ElementNumberOfChannels": planes.components,
-        "ElementType": f"MET_{_META[_kind(planes)]}", "ElementDataFile": "LOCAL",
+        "ElementType": f"MET_{_NAMES[planes.dtype.str[1:]][1]}", "ElementDataFile": "LOCAL",
     }  # fmt: skip
     return "".join(f"{key} = {value}\n" for key, value in fields.items()).encode(), b""
 
@@ -134,7 +130,8 @@ def _vti(planes: Planes, _: str) -> tuple[bytes, bytes]:
     grid = planes.grid
     extent = " ".join(f"0 {n - 1}" for n in grid.dims)
     place = f'Origin="{_words(grid.origin)}" Spacing="{_words(grid.spacing)}" Direction="{_words(grid.direction)}"'
-    array = f'type="{_VTK[_kind(planes)]}" Name="values" NumberOfComponents="{planes.components}"'
+    kind = {"f": "Float", "u": "UInt", "i": "Int"}[planes.dtype.kind] + str(8 * planes.dtype.itemsize)
+    array = f'type="{kind}" Name="values" NumberOfComponents="{planes.components}"'
     head = (
         '<?xml version="1.0"?>\n<VTKFile type="ImageData" version="1.0" byte_order="LittleEndian" '
         f'header_type="UInt64">\n<ImageData WholeExtent="{extent}" {place}>\n<Piece Extent="{extent}">'
@@ -145,8 +142,6 @@ def _vti(planes: Planes, _: str) -> tuple[bytes, bytes]:
 
 
 def _npy(planes: Planes, _: str) -> tuple[bytes, bytes]:
-    import io
-
     shape = planes.grid.dims[::-1] + ((planes.components,) if planes.components > 1 else ())
     head, stream = {"descr": planes.dtype.newbyteorder("<").str, "fortran_order": False, "shape": shape}, io.BytesIO()
     np.lib.format.write_array_header_1_0(stream, head)

@@ -15,7 +15,7 @@ from vvgt_cli.conversion.parts import Refiner, choose_levels, closed_form_parts,
 from vvgt_cli.conversion.request import Limits
 from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.conversion.stages.closed_form import ClosedFormStage
-from vvgt_cli.conversion.stages.refinement import HARMONICS, steps_in_time
+from vvgt_cli.conversion.stages.refinement import HARMONICS, early_end, steps_in_time
 from vvgt_cli.conversion.stored import FinishedParts
 from vvgt_cli.field.block_store import CELLS
 from vvgt_cli.field.blocked import Blocked
@@ -72,7 +72,7 @@ class OutOfCore(Stage):
         run, field = work.run, work.field
         assert isinstance(field, Blocked)
         if self.together and self.steps:
-            run.console.message(f"more than {MANY:,} Gaussians: refined part by part (docs/scale.md)")
+            run.console.message(f"more than {MANY:,} Gaussians: refined part by part (docs/blocks.md)")
         if self.alone:
             field.views.expect(scored_views(work.fit.screen))
         make_blocks(work, field)
@@ -109,7 +109,8 @@ class OutOfCore(Stage):
         if fit.device != "cpu":
             run.console.message("steps on parts are taken on the CPU: their pixels have weights, which a GPU ignores")
         run.compile(for_degree(OPTIMIZE, work.degree))
-        return Refiner(field.reader, field.light, replace(fit, steps=steps, device="cpu"), Limits(limits.target_psnr))
+        plain, target = replace(fit, steps=steps, device="cpu"), Limits(limits.target_psnr)
+        return Refiner(field.reader, field.light, plain, target, early_end(fit, limits))
 
 
 def make_blocks(work: Work, field: Blocked) -> None:

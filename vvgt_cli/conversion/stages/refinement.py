@@ -13,11 +13,11 @@ import numpy as np
 from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.conversion.request import FitOptions, Limits
 from vvgt_cli.conversion.stage import Cost, Stage, Work
-from vvgt_cli.defaults import FEWEST_STEPS, MAX_STEPS, METHOD, STEPS
+from vvgt_cli.defaults import EARLY, FEWEST_STEPS, MAX_STEPS, METHOD, STEPS
 from vvgt_cli.errors import DeviceFailed
 from vvgt_cli.field.workload import Workload, view_edge
 from vvgt_cli.gaussians import MIN_ALPHA, Gaussians, as_stored
-from vvgt_cli.refine import OptimizeOptions, OptimizeRecord, optimize
+from vvgt_cli.refine import Later, OptimizeOptions, OptimizeRecord, optimize
 from vvgt_cli.score.record import Run
 from vvgt_cli.score.views import Views
 
@@ -28,8 +28,8 @@ CHECK_EVERY = 25  # steps between checks where a target ends the run; else one c
 SMALLEST = 0.5  # standard deviation of the longest axis, in screen pixels, below which viewers drop or fade splats
 MIN_KEPT = 0.99  # share of the Gaussians that usually remain where small ones are widened
 REASONS = {
-    "steps": "", "time": "time is up", "target": "target reached", "no gain": "ended early: no more gain",
-    "interrupted": "interrupted",
+    "steps": "", "unseen": "more would hardly be seen", "time": "time is up", "target": "target reached",
+    "no gain": "ended early: no more gain", "interrupted": "interrupted",
 }  # fmt: skip
 
 
@@ -43,7 +43,15 @@ def most_steps(fit: FitOptions, limits: Limits) -> int:
     """Return the requested number of steps, else `STEPS`, or `MAX_STEPS` if a target or a time budget ends them."""
     if fit.steps is not None:
         return fit.steps
-    return STEPS if limits.target_psnr is None and limits.time_budget is None else MAX_STEPS
+    return MAX_STEPS if limits.ended else STEPS
+
+
+def early_end(fit: FitOptions, limits: Limits) -> int | None:
+    """Return the steps after which descent may end since nobody sees a difference; None where the user decides.
+
+    A network uses all views, so that it ends none early.
+    """
+    return None if fit.steps is not None or fit.model is not None or limits.ended else EARLY
 
 
 def steps_in_time(steps: int, left: float | None, seconds: Callable[[int], float]) -> int:
@@ -60,6 +68,7 @@ class Refinement(Stage):
         steps: number of steps that the plan has time for.
         most: number of steps where there is more time.
         small: whether the training views are small.
+        early: number of steps where no difference is seen after these; None: it does not end early.
         overlap: whether descent begins with wider Gaussians (`WIDER`), since they lie on the lattice of cells.
     """
 
@@ -68,6 +77,7 @@ class Refinement(Stage):
     steps: int = 0
     most: int = 0
     small: bool = False
+    early: int | None = None
     overlap: bool = False
 
     def cost(self, workload: Workload) -> Cost:
@@ -76,7 +86,7 @@ class Refinement(Stage):
 
     def label(self) -> str:
         """Return the number of steps."""
-        return f"{self.steps} steps"
+        return f"{self.steps} steps" + ("" if self.early is None else f", or {self.early}")
 
     def run(self, work: Work) -> None:
         """Descend, and remove Gaussians that viewers would discard."""
@@ -92,11 +102,15 @@ class Refinement(Stage):
         options = OptimizeOptions.of(
             "axes", steps=self.most, time_budget=remaining, target_psnr=target, rule=work.train_rule,
             check_rule=work.check_rule, seed=work.fit.seed, checkpoint=work.checkpoint.descent, device=work.fit.device,
-            check_every=CHECK_EVERY if target is not None else max(CHECK_EVERY, self.most // 2),
+            early=self.early, check_every=CHECK_EVERY if target is not None else max(CHECK_EVERY, self.most // 2),
         )  # fmt: skip
         start = work.current()
         begin = (widened(start, WIDER, pixel_width(work.fit.screen)), work.psnr(start)) if self.overlap else None
-        work.gaussians = refine(work.run, start, work.train, work.check, options, begin)
+        work.gaussians = refine(work.run, start, work.train, work.check, options, begin, later=work.later)
+        made = work.run.report.refinement
+        if work.later is not None and made is not None and made["steps"] <= (self.early or 0):
+            work.train = work.train.take(range(work.later[0]))
+            made["views"] = len(work.train)
         if work.weigh is None:
             work.gaussians = _drop_undrawn(work, work.gaussians)
 
@@ -111,7 +125,7 @@ def _drop_undrawn(work: Work, gaussians: Gaussians) -> Gaussians:
 
 def refine(
     run: Run, start: Gaussians, train: Views, check: Views, options: OptimizeOptions,
-    begin: tuple[Gaussians, float] | None = None, free: np.ndarray | None = None,
+    begin: tuple[Gaussians, float] | None = None, free: np.ndarray | None = None, later: Later | None = None,
 ) -> Gaussians:  # fmt: skip
     """Run the stage and return the best Gaussians by the check views, as a file holds them.
 
@@ -123,6 +137,7 @@ def refine(
         options: options of descent.
         begin: wider Gaussians that descent begins with, and the dB of ``start`` on the check views.
         free: (K,) bool, the Gaussians that may move; None for all.
+        later: as in `optimize`.
     """
     with run.stage("refinement") as stage, run.console.interruption(run.console.message) as stop:
         descend = partial(
@@ -135,6 +150,7 @@ def refine(
             stop=stop,
             free=free,
             weights=train.weights,
+            later=later,
         )
         result, record = _on_its_device(run, options, descend)
         if begin is not None:

@@ -1,4 +1,4 @@
-"""OpenVDB files, format versions 222 to 224, as OpenVDB reads them bit for bit.
+"""OpenVDB files, format versions 222 to 225, as OpenVDB reads them bit for bit.
 
 Read here because no wheel of OpenVDB exists; its own Python module, where a system has it, reads fewer types.
 """

@@ -1,6 +1,6 @@
 """The parts of an OpenVDB file around its trees: header, metadata, grid descriptors, transforms.
 
-Layout as openvdb/io/Archive.cc, GridDescriptor.cc, MetaMap.cc and math/Maps.h have it, format versions 222 to 224.
+Layout as openvdb/io/Archive.cc, GridDescriptor.cc, MetaMap.cc and math/Maps.h have it, format versions 222 to 225.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from vvgt_cli.volume.openvdb import MAGIC
 from vvgt_cli.volume.openvdb.codec import ACTIVE_MASK, BLOSC, ZIP, Cursor
 from vvgt_cli.volume.reading import FLAT, printable, unit_rows
 
-VERSIONS = range(222, 225)
+VERSIONS = range(222, 226)
 _UUID = 36
 _HALF = "_HalfFloat"
 _SEPARATOR = "\x1e"  # stands between the name and the number of grids of one name

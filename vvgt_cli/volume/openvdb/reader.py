@@ -1,4 +1,4 @@
-"""OpenVDB ``.vdb``, format versions 222 to 224: the active bounding box of one grid, bit for bit as OpenVDB reads it.
+"""OpenVDB ``.vdb``, format versions 222 to 225: the active bounding box of one grid, bit for bit as OpenVDB reads it.
 
 Read here because no wheel of OpenVDB exists; its own Python module, where a system has it, reads fewer types.
 

@@ -2,7 +2,7 @@
 
 Export is the ``vvgt`` command's, and so is the import of other files than ``.ply``.
 
-Tried: Blender 5.0.1 (bpy of PyPI)
+Tried: Blender 5.0.1, 5.3.0 (bpy of PyPI)
 Enable:
     Edit > Preferences > Get Extensions > Repositories > + > Add Local Repository, Custom Directory: {above}
     Edit > Preferences > Add-ons: enable Gaussian Splats.
@@ -79,7 +79,7 @@ class Splats:
 
 
 class ImportSplats(Splats, bpy.types.Operator, ImportHelper):
-    """Import Gaussian splats as points, drawn as ellipsoids."""
+    """Import Gaussian splats."""
 
     bl_idname, bl_label, bl_options = "import_scene.gaussian_splats", "Import Gaussian splats", {"UNDO"}
     __annotations__ = {  # as Blender wants properties

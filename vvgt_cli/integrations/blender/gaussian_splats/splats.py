@@ -1,4 +1,4 @@
-"""Gaussians in Blender: a point each, with its attributes, and nodes that draw it as viewers do."""
+"""Gaussians in Blender: its own splats from 5.3 on; before, a point each, and nodes that draw it as viewers do."""
 
 from __future__ import annotations
 
@@ -114,6 +114,11 @@ def ellipsoids() -> Any:
 def add(path: str, name: str) -> tuple[Any, list[str]]:
     """Add the Gaussians of a `.ply` to the scene, and return the object and what is not shown."""
     facts, rows = read_ply(path)
+    if "type" in bpy.types.PointCloud.bl_rna.properties:  # Blender 5.3 or newer draws splats itself, with harmonics
+        bpy.ops.wm.ply_import(filepath=path, forward_axis="Y", up_axis="Z")
+        made = bpy.context.view_layer.objects.active
+        made.name, made.matrix_world = name, placement(facts)
+        return made, []
     columns = {key: np.stack([rows[f"{key}_{i}"] for i in range(n)], 1) for key, n in
                (("f_dc", 3), ("scale", 3), ("rot", 4))}  # fmt: skip
     mesh = bpy.data.meshes.new(name)
