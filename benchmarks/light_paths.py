@@ -2,8 +2,8 @@
 
     PYTHONPATH=. python benchmarks/light_paths.py SCENES.tsv DATA_DIR TF_DIR --size 64 --paths 512 -o light-paths.csv
 
-`grid_db`: dB over RGB of the ray-cast view (test view 3, 3 x 3 rays a pixel) against the picture of paths; `noise_db`: of
-the latter, from its halves; `light_seconds`: processor time of the grid.
+`grid_db`: dB over RGB of the ray-cast view (test view 3, 3 x 3 rays a pixel) against the picture of paths; `noise_db`:
+of the latter, from its halves; `light_seconds`: processor time of the grid.
 """
 
 from __future__ import annotations
