@@ -13,6 +13,8 @@ from vvgt_cli.dvr.light import sphere
 from vvgt_cli.dvr.sky import COLUMNS, ROWS, Sky, directions, sky_of
 from vvgt_cli.dvr.traced import lines, path_view
 from vvgt_cli.errors import UsageError
+from vvgt_cli.field.open import FieldNeeds, _settings
+from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.gaussians.formats import read_splats
 from vvgt_cli.images.files import read_png
@@ -256,6 +258,19 @@ def test_a_picture_shines_from_where_it_is_bright(tmp_path, ending):
     assert red == pytest.approx(3 * blue, rel=0.02)
     one = sky_of(str(write_light(tmp_path / f"one.{ending}", np.ones((1, 1, 3)))), FRONT, np.eye(3))
     np.testing.assert_allclose(one.radiance, 1, rtol=0.05)
+
+
+def test_another_picture_of_the_same_name_is_another_light(tmp_path):
+    path = write_light(tmp_path / "light.exr", np.ones((4, 8, 3)))
+    asked = SourceRequest(np.eye(3)[None], tf="bone", light=LightOptions((str(path),)))
+    light, kept = asked.light.lighting(None, None), _settings(asked, FieldNeeds(1, 1))["skies"]
+    before = light.key()
+    assert before.startswith(light.text())
+    write_light(path, np.full((5, 8, 3), 0.5))
+    assert light.key() != before
+    assert _settings(asked, FieldNeeds(1, 1))["skies"] != kept
+    path.unlink()
+    assert light.key() == light.text()  # whoever traces it says that it is missing
 
 
 @pytest.mark.parametrize("wrong", ["negative", "infinite", "none", "half", "missing"])

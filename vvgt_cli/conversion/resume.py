@@ -125,7 +125,7 @@ def checkpoint_of(folder: str | None, field: Field, fit: FitOptions, limits: Lim
         "volume": digest(field.digest(), source.volume.name, source.volume.dims, source.volume.affine),
         "function": source.look(),
         "opacity_unit_distance": source.unit_distance,
-        "light": None if source.lighting is None else source.lighting.text(),
+        "light": None if source.lighting is None else source.lighting.key(),
         **asdict(fit),
         **asdict(limits),
         "model": read_text(find_model(fit.model) / CARD) if fit.model else None,

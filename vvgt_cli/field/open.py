@@ -27,6 +27,7 @@ from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians.outputs import STDOUT
 from vvgt_cli.jit.ahead import COUNT_REAL, COUNT_WHOLE, for_blocks
 from vvgt_cli.look.labels import NO_LABELS
+from vvgt_cli.look.lighting import PICTURES
 from vvgt_cli.progress import Console
 from vvgt_cli.resources import free_memory
 from vvgt_cli.score.record import Run
@@ -386,6 +387,7 @@ def _settings(request: SourceRequest, needs: FieldNeeds) -> dict[str, Any]:
         "read": {key: repr(value) for key, value in asdict(request.read).items() if value is not None},
         "function": [text, request.tf_range, request.unit_distance],
         "look": [repr(request.light), _facts(request.labels), *(repr(layer) for layer in request.layers)],
+        "skies": [_facts(light) for light in request.light.lights if light.lower().endswith(PICTURES)],
         "series": digest(*request.statistics),
         "gaussians": [needs.gaussians, needs.degree, needs.on_disk, needs.values],
         "size": needs.size,

@@ -261,7 +261,7 @@ class StyledVolume:
 
     def shown_as(self) -> str:
         """Return a digest of functions, tables, unit distances and light, but not of any volume."""
-        return digest(*self._optics(), self.lighting and self.lighting.text())[:OPTICS]
+        return digest(*self._optics(), self.lighting and self.lighting.key())[:OPTICS]
 
     def _optics(self) -> list[Any]:
         """Return the tables, functions and unit distances as a flat list."""
