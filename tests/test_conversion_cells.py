@@ -38,7 +38,7 @@ def test_cells_are_chosen_by_views_from_all_sides(tmp_path, monkeypatch):
         return start.gaussians
 
     monkeypatch.setattr("vvgt_cli.closed_form.cut_by_error", seen)
-    monkeypatch.setattr("vvgt_cli.conversion.stages.refinement.refine", lambda run, start, *_, later: start)
+    monkeypatch.setattr("vvgt_cli.conversion.stages.refinement.refine", lambda run, start, *_: start)
     done(tmp_path, FitOptions(60, 16, steps=200))
     eyes = np.array([camera.position for camera in used])
     eyes /= np.linalg.norm(eyes, axis=1, keepdims=True)

@@ -27,17 +27,12 @@ def views(g, cameras):
 TRUTH = cloud(seed=1)
 
 
-def run(path=None, stop=None, method="axes", start=None, steps=30, early=None, first=None):
-    """Optimize by views of which ``first`` are drawn, the others when they are asked for."""
+def run(path=None, stop=None, method="axes", start=None, steps=30, early=None):
     options = OptimizeOptions.of(
         method, steps=steps, early=early, check_every=5, max_gaussians=50, checkpoint=path and str(path)
     )
     images, check = views(TRUTH, CAMERAS), (CHECKS, views(TRUTH, CHECKS))
-    if first is None:
-        return optimize(start or cloud(), CAMERAS, images, options, check, stop=stop)
-    whole, images[first:] = images.copy(), np.nan
-    later = first, lambda: np.copyto(images[first:], whole[first:])
-    return optimize(start or cloud(), CAMERAS, images, options, check, stop=stop, later=later)
+    return optimize(start or cloud(), CAMERAS, images, options, check, stop=stop)
 
 
 def after(steps):
@@ -68,18 +63,18 @@ def test_an_interrupted_run_ends_as_a_whole_one(method, count, tmp_path):
 
 @pytest.mark.parametrize(("unseen", "steps", "reason"), [(1.0, 14, "unseen"), (0.0, 30, "steps")])
 def test_a_run_ends_early_where_no_difference_is_seen(unseen, steps, reason, tmp_path, monkeypatch):
-    """Else all views are drawn; interrupted before and after the decision, it ends alike."""
+    """Interrupted before and after the decision, it ends alike."""
     monkeypatch.setattr("vvgt_cli.refine.loop.UNSEEN", unseen)
-    whole, expected = run(early=14, first=3)
+    whole, expected = run(early=14)
     assert (expected.steps, expected.reason) == (steps, reason)
     assert 0 < expected.difference < 1
     assert np.isfinite(whole.means).all()
     path = tmp_path / "run.npz"
     for end in (5, 3):  # after 5 and 8 steps
-        _, record = run(path, after(end), early=14, first=3)
+        _, record = run(path, after(end), early=14)
     assert record.steps == 8
     assert (record.difference is None, record.reason) == (False, "interrupted")
-    result, record = run(path, early=14, first=3)
+    result, record = run(path, early=14)
     assert (record.steps, record.difference) == (steps, expected.difference)
     for field in FIELDS:
         assert getattr(result, field).tobytes() == getattr(whole, field).tobytes(), field

@@ -251,8 +251,7 @@ def refine_part(part: VolumePart, gaussians: Gaussians, refiner: Refiner, distan
     if work.target_reached():
         return gaussians
     early = None if refiner.early is None or refiner.early >= steps else refiner.early
-    first = None if early is None else view_count(early, small=True)
-    TrainingViews(view_count(steps, small=True), edge, first=first).run(work)
+    TrainingViews(view_count(steps, small=True), edge).run(work)
     if fit.model is not None:
         Network(fit.model).run(work)
     better = work.gaussians is not start

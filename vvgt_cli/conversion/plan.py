@@ -201,13 +201,10 @@ class Planner:
         early = None if early is None or early >= steps else early
         return [
             CheckViews(),
-            TrainingViews(
-                view_count(steps, small), view_edge(self.fit.screen, small),
-                first=None if early is None else view_count(early, small),
-            ),
+            TrainingViews(view_count(steps, small), view_edge(self.fit.screen, small)),
             *([CellsByError(small, keep=not self._recuts())] if enough and self.fit.model is None else []),
             Refinement(steps, most, small, early, overlap=enough),
-        ]  # fmt: skip
+        ]
 
     def _recuts(self) -> bool:
         """Return whether the pyramid may be cut again, for fewer Gaussians."""

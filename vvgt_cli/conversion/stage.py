@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from vvgt_cli.conversion.stored import FinishedParts, Levels
     from vvgt_cli.dvr import RenderSettings
     from vvgt_cli.field.field import Field, Picture
-    from vvgt_cli.refine import Later
 
 
 class Cost(NamedTuple):
@@ -47,7 +46,6 @@ class Work:
         start: the closed form, once made, with its pyramid.
         gaussians: current Gaussians, box frame.
         check, train: views to measure PSNR on, and to fit to, once rendered.
-        later: how many of the training views are drawn, and draws the others; None: all are.
         train_rule, train_settings: drawing rule of the training views, and settings of their references.
         compared: the Gaussians and check views last compared, and their PSNR (dB).
         ply: layout of the file.
@@ -69,7 +67,6 @@ class Work:
     gaussians: Gaussians | None = None
     check: Views | None = None
     train: Views | None = None
-    later: Later | None = None
     train_rule: Rule | None = None
     train_settings: RenderSettings | None = None
     compared: tuple[Gaussians, Views, float] | None = None
@@ -111,7 +108,7 @@ class Work:
     def reset(self) -> None:
         """Discard the results of all stages."""
         self.gaussians = self.check = self.train = self.train_rule = self.train_settings = self.compared = None
-        self.later = self.run.report.refinement = None
+        self.run.report.refinement = None
 
     def target_reached(self) -> bool:
         """Return whether the target PSNR is reached."""

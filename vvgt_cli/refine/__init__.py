@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from vvgt_cli.progress import ProgressCallback
-from vvgt_cli.refine.options import LOSS_3DGS, METHODS, Check, Later, OptimizeOptions, OptimizeRecord
+from vvgt_cli.refine.options import LOSS_3DGS, METHODS, Check, OptimizeOptions, OptimizeRecord
 
 if TYPE_CHECKING:
     import numpy as np
@@ -27,7 +27,6 @@ def optimize(
     stop: Callable[[], bool] | None = None,
     free: np.ndarray | None = None,
     weights: Sequence[np.ndarray] | None = None,
-    later: Later | None = None,
 ) -> tuple[Gaussians, OptimizeRecord]:
     """Minimise the difference between pictures of Gaussians and views by gradient descent.
 
@@ -43,15 +42,13 @@ def optimize(
         stop: asked before each step; True ends the run as a time budget would.
         free: (K,) bool, those that move, of the method "axes"; None: all.
         weights: of each training view, (h, w) factors of differences in the loss; None: 1.
-        later: number of views, from the first, that are drawn, and a function that draws the others into ``images``,
-            called where the run does not end early; None: all are.
 
     Raises:
         DataError: no views, or images or weights that do not fit their cameras.
     """
     from vvgt_cli.refine.loop import run
 
-    return run(gaussians, cameras, images, options or OptimizeOptions(), check, progress, stop, free, weights, later)
+    return run(gaussians, cameras, images, options or OptimizeOptions(), check, progress, stop, free, weights)
 
 
 def load_ahead() -> None:
@@ -67,4 +64,4 @@ def load_ahead() -> None:
     threading.Thread(target=run, daemon=True).start()
 
 
-__all__ = ["LOSS_3DGS", "METHODS", "Later", "OptimizeOptions", "OptimizeRecord", "load_ahead", "optimize"]
+__all__ = ["LOSS_3DGS", "METHODS", "OptimizeOptions", "OptimizeRecord", "load_ahead", "optimize"]

@@ -13,7 +13,7 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.progress import ProgressCallback
 from vvgt_cli.refine.checkpoint import Checks, fingerprint, resume, save
-from vvgt_cli.refine.options import Check, Later, OptimizeOptions, OptimizeRecord, Train
+from vvgt_cli.refine.options import Check, OptimizeOptions, OptimizeRecord, Train
 from vvgt_cli.refine.states import Densified, Fields, OnHost, OwnAxes, State
 
 UNSEEN = 12 / 255  # `visible_difference` halfway to an early end that is hardly seen at the end (docs/log/steps.md)
@@ -27,7 +27,7 @@ KEEP = 30.0  # seconds after which a run is kept, scored or not
 def run(
     gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarray, options: OptimizeOptions, check: Check | None,
     progress: ProgressCallback | None, stop: Callable[[], bool] | None, free: np.ndarray | None,
-    weights: Sequence[np.ndarray] | None, later: Later | None,
+    weights: Sequence[np.ndarray] | None,
 ) -> tuple[Gaussians, OptimizeRecord]:  # fmt: skip
     """Run `optimize` without its defaults."""
     _fit("training", cameras, images, None, weights)
@@ -38,17 +38,16 @@ def run(
     checks = Checks(state, check, record, options.check_rule)
     keep, course = _checkpoint(options, gaussians, (cameras, images), check, state, checks)
     entered, half = time.perf_counter(), 0 if options.early is None else options.early // 2
-    order = spread_views(cameras if later is None else cameras[: later[0]], options.seed)
+    order = spread_views(cameras, options.seed)
     if not record.checks:
         checks.measure(0.0)
         record.psnr_before = checks.best
     saved = entered
     spent, began = course.elapsed, time.perf_counter() - course.elapsed
-    for n in range(record.steps + 1):
-        if n == half and course.ends is not None:
-            options, order = _after_half(options, course.ends, cameras, later, order)
-        if n < record.steps:
-            next(order)
+    if course.ends is not None:
+        options = replace(options, steps=course.ends)
+    for _ in range(record.steps):
+        next(order)
     while True:
         course.elapsed = time.perf_counter() - began
         reason = _reason(options, checks, course.elapsed, stop)
@@ -64,7 +63,7 @@ def run(
             checks.measure(time.perf_counter() - began)
             record.difference = checks.difference
             course.ends = options.early if checks.difference <= UNSEEN else options.steps
-            options, order = _after_half(options, course.ends, cameras, later, order)
+            options = replace(options, steps=course.ends)
         expected = _expected(options, record.steps, course.elapsed)
         if progress:
             progress(record.steps, expected)
@@ -91,16 +90,6 @@ class _Course:
     elapsed: float = 0.0
     scored: int = 0
     ends: int | None = None  # the step after which the run ends, once decided halfway to an early end
-
-
-def _after_half(
-    options: OptimizeOptions, ends: int | None, cameras: Sequence[Camera], later: Later | None, order: Iterator[int]
-) -> tuple[OptimizeOptions, Iterator[int]]:
-    """Return options and views of the steps that follow the decision to end after ``ends`` steps."""
-    if later is not None and ends != options.early:
-        later[1]()
-        order = spread_views(cameras, options.seed)
-    return replace(options, steps=ends), order
 
 
 def _checkpoint(

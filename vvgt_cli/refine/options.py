@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -21,7 +21,6 @@ LOSS_3DGS = {"l1": 0.8, "l2": 0.0, "ssim": 0.2, "alpha": 0.0}
 TEXTURE = 6.0  # weight of the term for texture beside that of the squares (docs/log/closed-form.md)
 LOSSES: dict[str, dict[str, float]] = {"axes": {"texture": TEXTURE}, "3dgs": LOSS_3DGS}
 Train: TypeAlias = "tuple[Sequence[Camera], np.ndarray]"
-Later: TypeAlias = "tuple[int, Callable[[], None]]"  # how many of the training views are drawn; draws the others
 Check: TypeAlias = "Train | tuple[Sequence[Camera], np.ndarray, Sequence[Blocks] | None, Sequence[np.ndarray] | None]"
 
 

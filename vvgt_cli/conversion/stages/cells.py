@@ -51,8 +51,7 @@ class CellsByError(Stage):
             work.gaussians = kept[0]
             return
         with run.stage(self.name) as stage:
-            drawn = train.cameras[: work.later[0]] if work.later else train.cameras
-            chosen = farthest_cameras(drawn, VIEWS)  # every fourth or fifth view would lie in bands
+            chosen = farthest_cameras(train.cameras, VIEWS)  # every fourth or fifth view would lie in bands
             cameras = [train.cameras[i] for i in chosen]
             before = work.psnr(work.current())
             recut = cut_by_error(work.start, cameras, train.images[chosen], work.train_rule)

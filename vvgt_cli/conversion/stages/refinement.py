@@ -17,7 +17,7 @@ from vvgt_cli.defaults import EARLY, FEWEST_STEPS, MAX_STEPS, METHOD, STEPS
 from vvgt_cli.errors import DeviceFailed
 from vvgt_cli.field.workload import Workload, view_edge
 from vvgt_cli.gaussians import MIN_ALPHA, Gaussians, as_stored
-from vvgt_cli.refine import Later, OptimizeOptions, OptimizeRecord, optimize
+from vvgt_cli.refine import OptimizeOptions, OptimizeRecord, optimize
 from vvgt_cli.score.record import Run
 from vvgt_cli.score.views import Views
 
@@ -106,11 +106,7 @@ class Refinement(Stage):
         )  # fmt: skip
         start = work.current()
         begin = (widened(start, WIDER, pixel_width(work.fit.screen)), work.psnr(start)) if self.overlap else None
-        work.gaussians = refine(work.run, start, work.train, work.check, options, begin, later=work.later)
-        made = work.run.report.refinement
-        if work.later is not None and made is not None and made["steps"] <= (self.early or 0):
-            work.train = work.train.take(range(work.later[0]))
-            made["views"] = len(work.train)
+        work.gaussians = refine(work.run, start, work.train, work.check, options, begin)
         if work.weigh is None:
             work.gaussians = _drop_undrawn(work, work.gaussians)
 
@@ -125,7 +121,7 @@ def _drop_undrawn(work: Work, gaussians: Gaussians) -> Gaussians:
 
 def refine(
     run: Run, start: Gaussians, train: Views, check: Views, options: OptimizeOptions,
-    begin: tuple[Gaussians, float] | None = None, free: np.ndarray | None = None, later: Later | None = None,
+    begin: tuple[Gaussians, float] | None = None, free: np.ndarray | None = None,
 ) -> Gaussians:  # fmt: skip
     """Run the stage and return the best Gaussians by the check views, as a file holds them.
 
@@ -137,7 +133,6 @@ def refine(
         options: options of descent.
         begin: wider Gaussians that descent begins with, and the dB of ``start`` on the check views.
         free: (K,) bool, the Gaussians that may move; None for all.
-        later: as in `optimize`.
     """
     with run.stage("refinement") as stage, run.console.interruption(run.console.message) as stop:
         descend = partial(
@@ -150,7 +145,6 @@ def refine(
             stop=stop,
             free=free,
             weights=train.weights,
-            later=later,
         )
         result, record = _on_its_device(run, options, descend)
         if begin is not None:

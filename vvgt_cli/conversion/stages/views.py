@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from vvgt_cli.cameras import SET_VIEWS, Blocks, Camera, default_views, farthest_cameras, pixel_width, spread_blocks
+from vvgt_cli.cameras import SET_VIEWS, Blocks, Camera, default_views, pixel_width, spread_blocks
 from vvgt_cli.conversion.request import FitOptions
 from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.field.field import Picture
@@ -88,15 +87,12 @@ class TrainingViews(Stage):
         count: number of views.
         edge: pixels along their edge.
         fitted: whether descent fits to them, which needs finer integration.
-        first: number of views that are drawn before descent, far apart from each other; the others where it does not
-            end early. None: all.
     """
 
     name: ClassVar[str] = "views"
     count: int = SET_VIEWS["train"]
     edge: int = 200
     fitted: bool = True
-    first: int | None = None
 
     def cost(self, workload: Workload) -> Cost:
         """Return the cost by pixels."""
@@ -127,23 +123,12 @@ class TrainingViews(Stage):
         settings = FIT_VIEWS
         if self.fitted:
             settings = ray_settings(work.field.views, work.current(), self.edge, work.train_rule, _spread(footprint))
-        cameras, first = default_views("train", self.count, size=self.edge), self.count
-        if self.first is not None and self.first < self.count:
-            chosen, first = farthest_cameras(cameras, self.first), self.first
-            cameras = [cameras[i] for i in (*chosen, *sorted({*range(self.count)} - {*chosen}))]
-        images = np.zeros((self.count, self.edge, self.edge, 4), np.float32)
-
-        def draw(begin: int, end: int) -> None:
-            bar = work.run.console.bar(self.name)
-            images[begin:end] = render_views(work.field.views, cameras[begin:end], settings, progress=bar)
-
+        cameras = default_views("train", self.count, size=self.edge)
         with work.run.stage(self.name) as stage:
-            draw(0, first)
+            images = render_views(work.field.views, cameras, settings, progress=work.run.console.bar(self.name))
             rays = "one ray" if settings.samples == 1 else "adaptive rays"
-            more = "" if first == self.count else f" ({self.count} where descent goes on)"
-            stage.note = f"{first} of {self.edge} px{more} to fit to, {rays} a pixel, steps of {settings.step:g}"
+            stage.note = f"{self.count} of {self.edge} px to fit to, {rays} a pixel, steps of {settings.step:g}"
         work.train, work.train_settings = Views(cameras, images), settings
-        work.later = None if first == self.count else (first, partial(draw, first, self.count))
         if work.weigh is not None:
             work.train = work.train.weighed(work.weigh)
 
