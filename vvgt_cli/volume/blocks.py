@@ -51,6 +51,12 @@ def check_memory(need: int, what: str, instead: str = MAPPED) -> None:
         )
 
 
+def is_large(need: int) -> bool:
+    """Tell whether ``need`` bytes are more than `SHARE` of the free memory."""
+    free = free_memory()
+    return free is not None and need > SHARE * free
+
+
 class _ZlibStream:
     """``read(n)`` over a zlib stream in a file; it never holds more than it was asked for."""
 
@@ -127,8 +133,7 @@ def load_block(
             f"{path.name}: {size_text(max(size - offset, 0))} of {encoding} data cannot hold the "
             f"{size_text(need + skip)} that its header declares; check the header's sizes and type"
         )
-    free = free_memory()
-    if packed and len(shape) == 3 and free is not None and need > SHARE * free:
+    if packed and len(shape) == 3 and is_large(need):
         left: Any = Packed(path, dtype, shape, encoding, (offset, skip))
         result: np.ndarray = left
         return result
