@@ -385,11 +385,11 @@ def _placed(
             f"{source}: {steps_text}; expected evenly spaced values: try --dims X Y Z to resample to a regular grid, "
             "or --spacing X Y Z to take the values as evenly spaced"
         )
-    from vvgt_cli.volume.vtk.resample import rectilinear, resample
+    from vvgt_cli.volume.vtk.resample import resample
 
     points = [np.arange(a.size, dtype=float) if c is None else c for a, c in zip(axes, centres, strict=True)]
     data = (field * np.float64(scaling[0]) + scaling[1]).ravel()
-    return resample(rectilinear(points[::-1]), data, "point", options.dims, source, name)
+    return resample(points[::-1], data, options.dims, source, name)
 
 
 def _left(

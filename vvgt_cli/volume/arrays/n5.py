@@ -153,18 +153,6 @@ def read_array(path: Path, options: ReadOptions) -> Volume:
         return labelled_volume(array.read, dtype, _axes(array), {}, options, str(place), name, array.blocks)
 
 
-def level_shapes(path: Path, options: ReadOptions) -> list[tuple[int, ...]]:
-    """List the shapes of the levels of a pyramid, finest first; none where there is none."""
-    if not path.is_dir() or not holds_n5(path):
-        return []
-    try:
-        if shapes := bigdataviewer.level_shapes(path, options):
-            return shapes
-        return [_array(place).shape for place in _levels(inside(path, options.array))]
-    except (OSError, ValueError, TypeError, KeyError, DataError, UsageError):
-        return []  # said where it is read
-
-
 def _levels(group: Path) -> list[Path]:
     """List the folders ``s0``, ``s1``, ... of arrays in a group that is no array itself."""
     if "dimensions" in _metadata(group):

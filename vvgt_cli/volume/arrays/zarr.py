@@ -121,9 +121,11 @@ def inside(path: Path, wanted: str | None) -> Path:
 
 def json_object(file: Path) -> dict[str, Any]:
     """Read a file of metadata; raise DataError for more than `MAX_METADATA` bytes, or no JSON object."""
-    if file.stat().st_size > MAX_METADATA:
-        raise DataError(f"{file}: {file.stat().st_size} bytes; expected metadata of at most 16 MiB")
-    content = json.loads(file.read_text("utf-8"))
+    with file.open("rb") as stream:
+        text = stream.read(MAX_METADATA + 1)
+    if len(text) > MAX_METADATA:
+        raise DataError(f"{file}: more than 16 MiB; expected metadata of at most that")
+    content = json.loads(text)
     if not isinstance(content, dict):
         raise DataError(f"{file}: expected a JSON object of metadata")
     return content
@@ -141,22 +143,14 @@ def _metadata(folder: Path) -> dict[str, Any]:
     return {}
 
 
-def level_shapes(path: Path, options: ReadOptions) -> list[tuple[int, ...]]:
-    """List the shapes of the levels of an OME-Zarr image, finest first; none where a store is no such image."""
-    here = path / (options.array or "").strip("/")
-    if not here.is_dir() or not holds_zarr(here) or not here.resolve().is_relative_to(path.resolve()):
-        return []
-    places = [here / str(entry.get("path")) for entry in _multiscale(here).get("datasets", [])]
-    inside = [place for place in places if place.resolve().is_relative_to(path.resolve())]
-    return [tuple(_metadata(place).get("shape", ())) for place in inside]
-
-
 def _choose(path: Path, wanted: str | None, number: int | None) -> tuple[Path, dict[str, Any]]:
     """Return folder and metadata of the array asked for, else of the image's level ``number``, else of the only one."""
     here = inside(path, wanted)
     facts = _metadata(here)
     if facts.get("node_type") == "array":
         choose_grid({here.name: (facts["shape"], _type(facts))}, here.name, str(path))
+        if number is not None:
+            raise UsageError(f"{path}: an array without levels; leave out --level {number}")
         return here, facts
     level = _multiscale(here)
     if number is not None and not level:
@@ -183,7 +177,7 @@ def _arrays(root: Path) -> list[tuple[Path, dict[str, Any]]]:
     arrays: list[tuple[Path, dict[str, Any]]] = []
     groups = [root]
     while groups:
-        for folder in sorted(p for p in groups.pop(0).iterdir() if p.is_dir() and not p.is_symlink()):
+        for folder in sorted((p for p in groups.pop(0).iterdir() if not p.is_symlink()), key=str):
             facts = _metadata(folder)
             if facts.get("node_type") == "array" and facts.get("shape"):
                 arrays.append((folder, facts))
@@ -214,10 +208,7 @@ def _check_codecs(place: Path, facts: dict[str, Any]) -> None:
 def _attributes(folder: Path) -> dict[str, Any]:
     """Read the attributes of a node of either version."""
     old = folder / ".zattrs"
-    if old.is_file() and old.stat().st_size <= MAX_METADATA:
-        attributes = json.loads(old.read_text("utf-8"))
-    else:
-        attributes = _metadata(folder).get("attributes")
+    attributes = json_object(old) if old.is_file() else _metadata(folder).get("attributes")
     return attributes if isinstance(attributes, dict) else {}
 
 
@@ -231,10 +222,10 @@ def _beside(zarr: Any, path: Path, place: Path, names: Sequence[str]) -> dict[st
     group = place.parent
     folders = [group / name for name in names if name and "/" not in name and name not in (".", "..")]
     with suppress(OSError, NotImplementedError):
-        folders += [f for f in group.iterdir() if f.is_dir() and not f.is_symlink()] if place != path else []
+        folders += [f for f in group.iterdir() if not f.is_symlink()] if str(place) != str(path) else []
     neighbours = {}
     for folder in folders:
-        facts = _metadata(folder) if folder != place else {}
+        facts = _metadata(folder) if str(folder) != str(place) else {}
         if facts.get("node_type") == "array":
             neighbours[folder.name] = Neighbour.of(facts.get("shape", ()), partial(line, folder))
     return neighbours

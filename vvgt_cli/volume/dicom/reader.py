@@ -114,11 +114,11 @@ def read_dicom(path: Path, options: ReadOptions) -> Volume:
 
 def _resampled(volume: Volume, heights: np.ndarray, options: ReadOptions, path: Path) -> Volume:
     """Return a volume of slices at ``heights`` (n,) above the first, sampled on the grid asked for."""
-    from vvgt_cli.volume.vtk.resample import rectilinear, resample
+    from vvgt_cli.volume.vtk.resample import resample
 
     x, y = (step * np.arange(n) for step, n in zip(volume.spacing, volume.dims[:2], strict=False))
     values = volume.data * np.float64(volume.slope) + volume.intercept
-    sampled = resample(rectilinear([x, y, heights]), values.ravel(), "point", options.dims, str(path), volume.name)
+    sampled = resample([x, y, heights], values.ravel(), options.dims, str(path), volume.name)
     origin = tuple((np.array(volume.origin) + volume.axes @ np.array(sampled.origin)).tolist())
     place: dict[str, Any] = {"spacing": sampled.spacing, "origin": origin, "slope": 1.0, "intercept": 0.0}
     return replace(volume, data=sampled.data, name=sampled.name, **place)

@@ -18,7 +18,6 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError, VvgtError
-from vvgt_cli.volume.microscopy import imaris
 from vvgt_cli.volume.microscopy.image import MAX_XML, choose_channel, choose_image, safe_xml
 from vvgt_cli.volume.readers import lazy
 from vvgt_cli.volume.reading import ReadOptions, Volume, magnitude, need, printable
@@ -103,17 +102,6 @@ def read_beside(path: Path, options: ReadOptions) -> Volume | None:
     """Read an HDF5 file or N5 folder by the XML file beside it; return None where BigDataViewer did not lay it out."""
     bdv = _of_data(path, options.spacing is None)
     return None if bdv is None else _read(bdv, options)
-
-
-def level_shapes(path: Path, options: ReadOptions) -> list[tuple[int, ...]]:
-    """List the shapes (z, y, x) of the levels, finest first, of Imaris too; none for other or faulty files."""
-    if shapes := imaris.level_shapes(path, options):
-        return shapes
-    try:
-        bdv = _described(path) if _is_xml(path) else _of_data(path, False)
-        return [] if bdv is None else bdv.levels(bdv.present(bdv.times[0], bdv.setups[0]))
-    except (VvgtError, OSError):
-        return []  # said where it is read
 
 
 def _is_xml(path: Path) -> bool:

@@ -1,45 +1,18 @@
-"""VTK's datasets in memory as volumes: images as they are, grids and meshes resampled.
+"""Arrays and hidden cells of VTK's datasets in memory, and images as volumes.
 
 Cells are compared with points before VTK walks them.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.volume.components import ArrayInfo, choose_array, select_from_array
+from vvgt_cli.volume.components import ArrayInfo, select_from_array
 from vvgt_cli.volume.reading import ReadOptions, Volume, float_dtype, placed, printable
-from vvgt_cli.volume.vtk.resample import resample
 from vvgt_cli.volume.vtk.xml import GHOSTS, HIDDEN
-
-
-def dataset_volume(mesh: Any, options: ReadOptions, source: str, name: str) -> Volume:
-    """Make a volume of a vtkDataSet (pyvista's are): an image as it is, any other grid or mesh of cells resampled.
-
-    Errors are those of `Reader.read`.
-    """
-    if not mesh.IsA("vtkDataSet"):
-        raise DataError(f"{source}: a {mesh.GetClassName()}; expected one image, grid or mesh of cells")
-    if mesh.IsA("vtkPolyData"):
-        raise DataError(f"{source}: a surface (vtkPolyData); expected cells that fill a volume")
-    infos = arrays_of(mesh)
-    info = infos[choose_array(infos, options.array, source)]
-    if mesh.IsA("vtkImageData"):
-        return replace(_image(mesh, info, options, source, name), quantity=printable(info.name))
-    if options.spacing is not None:
-        raise UsageError(
-            f"{source}: its points say where values are; leave out --spacing (--dims says how many to take)"
-        )
-    check_cells(mesh, source)
-    mesh = shown(mesh)
-    values = values_of(mesh, info).reshape(1, 1, -1, info.components)
-    field = select_from_array(values, info, options.component, source)
-    volume = resample(mesh, field.ravel(), info.where, options.dims, source, name)
-    return replace(volume, quantity=printable(info.name))
 
 
 def values_of(mesh: Any, info: ArrayInfo) -> np.ndarray:
@@ -160,11 +133,12 @@ def _direction(image: Any) -> np.ndarray:
     return np.array([[matrix.GetElement(r, c) for c in range(3)] for r in range(3)])
 
 
-def _image(image: Any, info: ArrayInfo, options: ReadOptions, source: str, name: str) -> Volume:
+def image_volume(image: Any, info: ArrayInfo, options: ReadOptions, source: str, name: str) -> Volume:
     """Make a volume of a vtkImageData: point data, or cell data on the grid of cell centres."""
     if options.dims is not None:
         raise UsageError(f"{source}: an image, which is a regular grid already; leave out --dims")
     dims, spacing, origin = image_place(image, info.where)
     values = values_of(image, info).reshape(*dims[::-1], info.components)
     field = visible(image, select_from_array(values, info, options.component, source), info.where)
-    return placed(field, (_direction(image) * spacing).T, origin, options, name)
+    steps = (_direction(image) * spacing).T
+    return placed(field, steps, origin, options, name, quantity=printable(info.name))

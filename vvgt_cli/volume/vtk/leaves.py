@@ -14,7 +14,7 @@ import numpy as np
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.components import ArrayInfo, choose_array, select_from_array
 from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, count, float_dtype, printable, triple
-from vvgt_cli.volume.vtk.grids import arrays_of, check_cells, dataset_volume, image_place, shown, values_of, visible
+from vvgt_cli.volume.vtk.grids import arrays_of, check_cells, image_place, image_volume, shown, values_of, visible
 from vvgt_cli.volume.vtk.resample import MAX_EDGE, Samples, grid_of, probe, sampled_volume
 
 ALIGNED = 1e-3  # voxels that images of one lattice may lie off
@@ -72,6 +72,16 @@ def arrays_in(leaves: Sequence[Leaf]) -> list[ArrayInfo]:
     return list(infos.values())
 
 
+def dataset_volume(mesh: Any, options: ReadOptions, source: str, name: str) -> Volume:
+    """Make a volume of a vtkDataSet (pyvista's are): an image as it is, any other grid or mesh of cells resampled.
+
+    Errors are those of `Reader.read`.
+    """
+    if not mesh.IsA("vtkDataSet"):
+        raise DataError(f"{source}: a {mesh.GetClassName()}; expected one image, grid or mesh of cells")
+    return volume_of([Leaf(mesh)], options, source, name)
+
+
 def volume_of(leaves: Sequence[Leaf], options: ReadOptions, source: str, name: str) -> Volume:
     """Make a volume of the array that is asked for, from all datasets with it; errors are those of `Reader.read`."""
     if not leaves:
@@ -80,18 +90,17 @@ def volume_of(leaves: Sequence[Leaf], options: ReadOptions, source: str, name: s
         check_cells(leaf.data, source)
     filled = (leaf for leaf in leaves if leaf.data.GetNumberOfCells() > 0 and not leaf.data.IsA("vtkPolyData"))
     deep = [leaf for leaf in filled if leaf.data.GetMaxSpatialDimension() == 3]
-    if len(leaves) == 1 or not deep:
-        return dataset_volume(leaves[0].data, options, source, name)
-    infos = arrays_in(deep)
-    if not infos:
-        raise DataError(f"{source}: no array of numbers in its {len(deep)} blocks; expected at least one")
+    chosen = deep if deep and len(leaves) > 1 else leaves[:1]
+    if chosen[0].data.IsA("vtkPolyData"):
+        raise DataError(f"{source}: a surface (vtkPolyData); expected cells that fill a volume")
+    infos = arrays_in(chosen)
     info = infos[choose_array(infos, options.array, source)]
-    holders = [leaf for leaf in deep if any((a.name, a.where) == (info.name, info.where) for a in arrays_of(leaf.data))]
-    if len(holders) == 1:
-        return dataset_volume(holders[0].data, replace(options, array=info.name), source, name)
+    holders = [one for one in chosen if any((a.name, a.where) == (info.name, info.where) for a in arrays_of(one.data))]
+    if len(holders) == 1 and holders[0].data.IsA("vtkImageData"):
+        return image_volume(holders[0].data, info, options, source, name)
     if options.spacing is not None:
         raise UsageError(
-            f"{source}: its blocks say where values are; leave out --spacing (--dims says how many to take)"
+            f"{source}: its points say where values are; leave out --spacing (--dims says how many to take)"
         )
     fields = [_field(leaf, info, options, source) for leaf in holders]
     dtype = np.result_type(*(values.dtype for _, values in fields))
@@ -159,6 +168,8 @@ def _samples(leaves: Sequence[Leaf], dims: tuple[int, int, int] | None, source: 
     bounds = np.array([leaf.data.GetBounds() for leaf in leaves]).reshape(-1, 3, 2)
     box = np.stack([bounds[..., 0].min(axis=0), bounds[..., 1].max(axis=0)], axis=1)
     cells = sum(leaf.data.GetNumberOfCells() for leaf in leaves)
+    if cells < 1:
+        raise DataError(f"{source}: a mesh without cells; expected some to sample")
     if dims is None and all(leaf.data.IsA("vtkImageData") and _upright(leaf.data) for leaf in leaves):
         finest = np.min([leaf.data.GetSpacing() for leaf in leaves], axis=0)
         if (finest > 0).all() and np.isfinite(box).all():
