@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.blocks import check_memory, data_file, is_large
+from vvgt_cli.volume.blocks import count, data_file, is_large
 from vvgt_cli.volume.components import ArrayInfo, choose_array, selected_dtype
 from vvgt_cli.volume.reading import ReadOptions, Volume, float_dtype, printable, triple, volume_name
-from vvgt_cli.volume.stored import Slices, Stored, is_file_backed, put_block, read_block
+from vvgt_cli.volume.stored import Slices, is_file_backed, put_block, read_block, stored_or_loaded
 from vvgt_cli.volume.vtk.xml import GHOSTS, HIDDEN, Scan, extent_dims, extent_of, image_grid, image_values, scan
 
 MAX_KEPT = 256 << 20  # bytes of unpacked pieces that a process keeps
@@ -43,10 +43,8 @@ def read_pvti(path: Path, options: ReadOptions) -> Volume:
     pieces = _Pieces(header, info, options, path)
     grid = image_grid(pieces.image, info.where, path)
     shape, dtype = grid.dims[::-1], pieces.dtype
-    field: Any = Stored(pieces.read, dtype, shape, pieces.chunks, str(path))
-    if not options.stored and not (options.packed and is_large(field.nbytes)):
-        check_memory(field.nbytes, str(path))
-        field = field[:, :, :]
+    kept = options.stored or (options.packed and is_large(count(shape) * dtype.itemsize))
+    field = stored_or_loaded(pieces.read, dtype, shape, pieces.chunks, str(path), kept)
     place = options.spacing_or(grid.spacing), grid.origin, grid.direction
     return Volume(field, *place, volume_name(path), quantity=printable(info.name))
 
