@@ -317,14 +317,10 @@ def test_npy_lies(tmp_path: Path) -> None:
     refused(DataError, r"axes unnamed \(7\); expected two or three axes", read_volume, str(tmp_path / "w.npy"))
 
 
-@pytest.mark.parametrize(
-    ("name", "module", "extra"), [("v.h5", "h5py", "hdf5"), ("v.nc", "h5py", "hdf5"), ("v.zarr", "zarr", "zarr")]
-)
+@pytest.mark.parametrize(("name", "module", "extra"), [("v.nc", "h5py", "hdf5"), ("v.zarr", "zarr", "zarr")])
 def test_a_missing_library_names_its_extra(tmp_path, monkeypatch, name, module, extra) -> None:
     if name == "v.zarr":
         zarr.create_array(str(tmp_path / name), data=VALUES)
-    elif name == "v.h5":
-        h5py.File(tmp_path / name, "w").create_dataset("field", data=VALUES).file.close()
     else:
         write_netcdf(tmp_path / name)
     monkeypatch.setitem(sys.modules, module, None)

@@ -124,8 +124,7 @@ def test_leaves_beyond_the_box_are_left_out() -> None:
         np.testing.assert_array_equal(found, whole[box])
 
 
-def test_a_large_grid_is_laid_out_slab_by_slab(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vvgt_cli.volume.openvdb.reader.is_large", lambda need: True)
+def test_a_grid_that_is_walked_through_is_not_laid_out(folder: Path) -> None:
     volume = read_volume(str(folder / "tiles.vdb"), ReadOptions(array="tiles", packed=True))
     assert isinstance(volume.data, Stored)
     numbers = statistics(volume)

@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.blocks import is_large
 from vvgt_cli.volume.components import choose, listed, select_component
 from vvgt_cli.volume.openvdb.archive import TYPES, Grid, read_grid_head, read_header
 from vvgt_cli.volume.openvdb.codec import Cursor
@@ -90,7 +89,7 @@ def read_vdb(path: Path, options: ReadOptions) -> Volume:
     tree = read_tree(cursor, grids, grid)
     lo, hi = bounding_box(tree, f"{path}: grid {grid}")
     values: Any = brick_array(tree, lo, hi, options.component, str(path), f"grid {grid.label!r}")
-    if not options.stored and not (options.packed and is_large(values.nbytes)):
+    if not (options.stored or options.packed):
         values = laid_out(values)
     origin = lo @ transform[:3] + transform[3]
     facts = {"quantity": printable(grid.name), "preset": LOOKS.get(grid.name, "")}

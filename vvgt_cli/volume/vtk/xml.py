@@ -275,7 +275,8 @@ def image_values(header: Scan, info: ArrayInfo, grid: Grid, options: ReadOptions
         if compressor in _UNPACK and (form == "binary" or (appended and header.appended in ("raw", "base64"))):
             start = start if appended else _text_of(path, row.position)
             coded = not appended or header.appended == "base64"
-            return packed_array(header, info, grid, start, coded, options, path)
+            packed: np.ndarray = packed_array(header, info, grid, start, coded, options, path)
+            return packed
     values: np.ndarray = IMAGE_BY_VTK(path, replace(options, array=info.name or None, spacing=None)).data
     return values
 
