@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-import struct
 import warnings
-import zlib
 from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
@@ -19,6 +17,7 @@ from vvgt_cli.volume.blocks import read_head
 from vvgt_cli.volume.bodies import without_other_bodies
 from vvgt_cli.volume.components import listed
 from vvgt_cli.volume.headers import MARK
+from vvgt_cli.volume.libraries import library_errors
 from vvgt_cli.volume.medical import MASKS
 from vvgt_cli.volume.options import ReadOptions, crop, masked, parse_crop
 from vvgt_cli.volume.plain import RAW
@@ -84,22 +83,19 @@ def _read(source: str, options: ReadOptions) -> Volume:
         return read_stdin(options)
     scheme, colon, rest = source.partition(":")
     if colon and scheme in SCHEMES:
-        return SCHEMES[scheme](rest, options)
+        with library_errors(source, "a volume"):
+            return SCHEMES[scheme](rest, options)
     path, options = _inner(source, options)
     if (kept := seekable(path)) != path:
         return _from_pipe(kept, path, source, options)
-    slices = _slices(source, options)
+    with library_errors(source, "slices"):
+        slices = _slices(source, options)
     if slices is not None:
         return slices
     reader = _folder(path, source) if os.path.isdir(path) else _find(path, _head(path, source), options)
     _check_options(reader, source, options)
-    try:
+    with library_errors(source, reader.name):
         return reader.read(path, options)
-    except (OSError, ValueError, struct.error, LookupError, ArithmeticError, EOFError, zlib.error) as error:
-        text = " ".join(str(error).split()) or type(error).__name__
-        raise DataError(f"{source}: damaged {reader.name} file ({text}); check that it is whole") from error
-    except MemoryError as error:
-        raise DataError(f"{source}: not enough memory to read it; try a machine with more") from error
 
 
 def _from_pipe(kept: Path, path: Path, source: str, options: ReadOptions) -> Volume:

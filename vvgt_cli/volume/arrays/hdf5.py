@@ -30,7 +30,7 @@ from vvgt_cli.volume.labelled import (
     described_by,
     labelled_volume,
 )
-from vvgt_cli.volume.libraries import library_errors, need, read_part
+from vvgt_cli.volume.libraries import need, read_part
 from vvgt_cli.volume.microscopy import bigdataviewer
 from vvgt_cli.volume.microscopy.imaris import is_imaris, read_imaris
 from vvgt_cli.volume.reading import ReadOptions, Volume, printable, text_of, volume_name
@@ -42,7 +42,7 @@ MAX_BESIDE = 1000  # members of a group that are looked at for coordinates
 def read_hdf5(path: Path, options: ReadOptions) -> Volume:
     """Read one dataset of an HDF5 file, or what Imaris or BigDataViewer have in one."""
     h5py = need("h5py", "hdf5", str(path), "HDF5")
-    with library_errors(str(path), "HDF5"), h5py.File(path, "r") as file:
+    with h5py.File(path, "r") as file:
         if is_imaris(file):
             return read_imaris(file, path, options, partial(checked_dataset, h5py, file, path))
     if (volume := bigdataviewer.read_beside(path, options)) is not None:
@@ -55,7 +55,7 @@ def read_hdf5(path: Path, options: ReadOptions) -> Volume:
 def read_dataset(path: Path, options: ReadOptions, fills: Mapping[str, float] | None = None) -> Volume:
     """Read one dataset of an HDF5 file, as it is; ``fills`` are values that are missing, by type."""
     h5py = need("h5py", "hdf5", str(path), "HDF5")
-    with library_errors(str(path), "HDF5"), h5py.File(path, "r") as file:
+    with h5py.File(path, "r") as file:
         dataset = _choose(h5py, file, options.array, path)
         source = f"{path}:{printable(dataset.name)}"
         check_storage(h5py, dataset, path, source)
@@ -64,8 +64,8 @@ def read_dataset(path: Path, options: ReadOptions, fills: Mapping[str, float] | 
         name = f"{volume_name(path)}:{dataset.name.strip('/')}"
         attributes = {key: dataset.attrs[key] for key in (*CF_ATTRIBUTES, *GEOMETRY, *NAMING) if key in dataset.attrs}
         attributes |= {key: up.attrs[key] for up in (file, dataset.parent) for key in GEOMETRY if key in up.attrs}
-        if dataset.dtype.str[1:] in (fills or {}):
-            attributes = {"_FillValue": fills[dataset.dtype.str[1:]]} | attributes
+        if (fill := (fills or {}).get(dataset.dtype.str[1:])) is not None:
+            attributes = {"_FillValue": fill} | attributes
         axes = scaled_axes(dataset)
         if not any(a.name or a.centres is not None for a in axes):
             axes, more = conventional_axes(file, dataset, source) or (axes, {})

@@ -19,7 +19,7 @@ from zipfile import ZipFile, is_zipfile
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.arrays import MAX_CHUNK
 from vvgt_cli.volume.arrays.zarr import MAX_METADATA, holds_zarr, read_zarr
-from vvgt_cli.volume.reading import ReadOptions, Volume, library_errors, need
+from vvgt_cli.volume.reading import ReadOptions, Volume, need
 
 SCHEMES = ("http", "https")
 
@@ -150,12 +150,11 @@ def _opened(url: str, options: ReadOptions) -> tuple[Path, ReadOptions]:
         head, inner = url, ""
     if inner and options.array is not None:
         raise UsageError(f"{url}: --array {options.array} and :/{inner} choose both; leave out one")
-    with library_errors(url, "Zarr"):
-        place = cast(Path, Remote(_Server(url), head.rstrip("/")))
-        if not holds_zarr(place):
-            raise DataError(
-                f"{url}: no Zarr there, or no answer (of another format download the file); expected .../x.ome.zarr"
-            )
+    place = cast(Path, Remote(_Server(url), head.rstrip("/")))
+    if not holds_zarr(place):
+        raise DataError(
+            f"{url}: no Zarr there, or no answer (of another format download the file); expected .../x.ome.zarr"
+        )
     return place, replace(options, array=inner or options.array)
 
 
@@ -197,7 +196,7 @@ def read_zipped(path: Path, options: ReadOptions) -> Volume:
     """Read one array of a zipped Zarr store, which may be a folder in the zip file."""
     if not is_zipfile(path):
         raise DataError(f"{path}: no zip file; expected a Zarr store in one")
-    with library_errors(str(path), "Zarr"), ZipFile(path) as file:
+    with ZipFile(path) as file:
         if any(entry.file_size > MAX_CHUNK for entry in file.infolist()):
             raise DataError(f"{path}: entries of more than 2 GiB; expected the chunks of a Zarr store")
         top = _Zipped(cast(Any, file), str(path))

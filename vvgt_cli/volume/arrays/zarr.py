@@ -23,7 +23,7 @@ from vvgt_cli.volume.arrays import MAX_CHUNK
 from vvgt_cli.volume.arrays.beside import Neighbour, choose_grid, with_neighbours
 from vvgt_cli.volume.labelled import Axis, axis, labelled_volume
 from vvgt_cli.volume.microscopy.image import hex_color
-from vvgt_cli.volume.reading import ReadOptions, Segment, Volume, library_errors, need, segments_in
+from vvgt_cli.volume.reading import ReadOptions, Segment, Volume, need, segments_in
 
 _CODECS = {
     *("blosc", "zstd", "gzip", "zlib", "lz4", "bz2", "lzma", "shuffle", "delta", "fixedscaleoffset", "quantize"),
@@ -42,23 +42,22 @@ def holds_zarr(path: Path) -> bool:
 def read_zarr(path: Path, options: ReadOptions) -> Volume:
     """Read one array of a Zarr store."""
     zarr = need("zarr", "zarr", str(path), "Zarr")
-    with library_errors(str(path), "Zarr"):
-        place, facts = _choose(path, options.array, options.level)
-        array = _array(zarr, place)
-        attributes = _marked(array)
-        names = facts.get("dimension_names") or attributes.get("_ARRAY_DIMENSIONS") or [""] * array.ndim
-        axes = _ome_axes(place, array.shape) or [
-            axis(str(name or ""), size) for name, size in zip(names, array.shape, strict=True)
-        ]
-        beside = _beside(zarr, path, place, [a.name for a in axes if a.centres is None])
-        axes = with_neighbours(axes, beside, str(place), options.spacing is not None)
-        volume = labelled_volume(
-            lambda index: np.asarray(array[index]), array.dtype, axes, attributes, options, str(place),
-            name_in(path, place), array.chunks,
-        )  # fmt: skip
-        if (labels := _ome(place.parent).get("image-label")) is None:
-            return volume
-        return replace(volume, segments=segments_in(lambda: _segments(labels), str(place)))
+    place, facts = _choose(path, options.array, options.level)
+    array = _array(zarr, place)
+    attributes = _marked(array)
+    names = facts.get("dimension_names") or attributes.get("_ARRAY_DIMENSIONS") or [""] * array.ndim
+    axes = _ome_axes(place, array.shape) or [
+        axis(str(name or ""), size) for name, size in zip(names, array.shape, strict=True)
+    ]
+    beside = _beside(zarr, path, place, [a.name for a in axes if a.centres is None])
+    axes = with_neighbours(axes, beside, str(place), options.spacing is not None)
+    volume = labelled_volume(
+        lambda index: np.asarray(array[index]), array.dtype, axes, attributes, options, str(place),
+        name_in(path, place), array.chunks,
+    )  # fmt: skip
+    if (labels := _ome(place.parent).get("image-label")) is None:
+        return volume
+    return replace(volume, segments=segments_in(lambda: _segments(labels), str(place)))
 
 
 def _segments(labels: dict[str, Any]) -> list[Segment]:

@@ -26,7 +26,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.microscopy.image import Micrograph, choose_image, picture_volume
-from vvgt_cli.volume.reading import ReadOptions, Slices, Volume, library_errors, metres, size_text, triple, volume_name
+from vvgt_cli.volume.reading import ReadOptions, Slices, Volume, metres, size_text, triple, volume_name
 from vvgt_cli.volume.tiff.decode import Pages
 from vvgt_cli.volume.tiff.ome import ome_tag, open_tiff, page_count, reported
 
@@ -86,7 +86,7 @@ def read_tiff(path: Path, options: ReadOptions, slices: int = 1) -> Volume:
     A volume has so many ``slices`` if the file is one of them.
     """
     page_count(path)
-    with library_errors(str(path), "TIFF"), reported(path), open_tiff(path) as file, Pages(path) as pages:
+    with reported(path), open_tiff(path) as file, Pages(path) as pages:
         root = ElementTree.fromstring(file.ome_metadata) if file.is_ome and file.ome_metadata else None
         count_planes(file)
         series, number = _series(file, options.array, path)

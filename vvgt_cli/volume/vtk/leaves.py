@@ -184,7 +184,7 @@ def _paint(data: Any, values: np.ndarray, where: str, grid: Samples, aligned: bo
     if aligned:
         dims, _, first = image_place(data, where)
         begin = np.round((first - origin) / step).astype(int)
-        end, sampled, inside = begin + dims, values.reshape(dims[::-1]), np.True_
+        end, sampled, inside = begin + dims, values.reshape(dims[::-1]), np.array(True)
     else:
         bounds = np.array(data.GetBounds()).reshape(3, 2)
         begin = np.maximum(np.ceil((bounds[:, 0] - origin) / step - EDGE), 0).astype(int)

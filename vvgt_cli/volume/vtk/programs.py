@@ -237,6 +237,7 @@ def _plot3d(path: Path) -> Any:
     """Make the reader of ``NAME.xyz`` with ``NAME.q`` or ``.f`` beside it, or of ParaView's ``.p3d`` (JSON)."""
     from vtkmodules.vtkIOParallel import vtkMultiBlockPLOT3DReader, vtkPlot3DMetaReader
 
+    reader: Any
     kinds = {"xyz": ".xyz", "q": ".q", "function": ".f"}
     if path.suffix.lower() == ".p3d":
         try:
