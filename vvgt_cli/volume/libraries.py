@@ -23,11 +23,13 @@ def need(module: str, extra: str, source: str, what: str) -> Any:
 
 @contextmanager
 def library_errors(source: str, what: str) -> Iterator[None]:
-    """Make whatever a library raises on a file one `DataError`; memory that runs out is left to the registry."""
+    """Make whatever is raised on a file, by libraries too, one `DataError`."""
     try:
         yield
-    except (VvgtError, MemoryError):
+    except VvgtError:
         raise
+    except MemoryError as error:
+        raise DataError(f"{source}: not enough memory to read it; try a machine with more") from error
     except Exception as error:  # libraries raise what they like on damaged files
         text = " ".join(str(error).split())[:300] or type(error).__name__
         raise DataError(f"{source}: cannot be read as {what} ({text}); check that it is whole") from error
