@@ -138,3 +138,25 @@ def test_arrays_of_a_mesh_are_listed_with_their_options(tmp_path: Path, vvgt) ->
         ("vector", 3, "--array vector"),
     ]
     assert b"--array vector" in vvgt("info", tmp_path / "v.vtu").out
+
+
+def test_lies_are_refused_before_vtk_reads(tmp_path: Path) -> None:
+    path = tmp_path / "v.vtu"
+    tetrahedra().save(path, binary=False)
+    text = path.read_text()
+    for old, new, message in (
+        ('NumberOfPoints="60"', 'NumberOfPoints="6000000000"', "cannot hold"),
+        ('NumberOfCells="', 'NumberOfCells="9000000', "cannot hold"),
+        ("<Cells>", "<Sells>", "damaged"),
+    ):
+        path.write_text(text.replace(old, new))
+        refused(DataError, message, read_volume, str(path), ReadOptions(array="ramp"))
+    legacy(tetrahedra(), tmp_path / "v.vtk", binary=False, version=42)
+    text = (tmp_path / "v.vtk").read_text()
+    for old, new, message in (
+        ("POINTS 60 ", "POINTS 6000000000 ", "values are declared"),
+        ("\n4 ", "\n4 777", "name points that do not exist"),
+    ):
+        assert old in text
+        (tmp_path / "v.vtk").write_text(text.replace(old, new, 1))
+        refused(DataError, message, read_volume, str(tmp_path / "v.vtk"), ReadOptions(array="ramp"))

@@ -1,5 +1,6 @@
 """VTK's image formats, written by VTK (or by hand where VTK cannot write them), SLC and TIFF."""
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from vtkmodules.vtkIOLegacy import vtkStructuredPointsReader, vtkStructuredPoint
 from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
 
 from tests.refused import refused
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.errors import DataError, UsageError, VvgtError
 from vvgt_cli.volume import ReadOptions, read_volume
 
 RNG = np.random.default_rng(3)
@@ -202,6 +203,23 @@ def test_legacy_sections_written_by_hand(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (legacy(b"POINT_DATA 60\nSCALARS a float\nLOOKUP_TABLE default\n" + bytes(239)), "240 bytes of values"),
+        (legacy(b"POINT_DATA 999999999999\nSCALARS a double\nLOOKUP_TABLE default\n" + bytes(64)), "are declared"),
+        (legacy(b"POINT_DATA 60\nNONSENSE\n"), "unknown section"),
+        (legacy(b""), "no array of numbers"),
+        (legacy(b"POINT_DATA 60\nSCALARS a int\n" + b"one " * 60, "ASCII"), "not a list of int32 numbers"),
+        (legacy(b"", kind="POLYDATA"), "of a polydata.*Resample To Image"),
+    ],
+)
+def test_legacy_lies(tmp_path: Path, text: bytes, message: str) -> None:
+    path = tmp_path / "v.vtk"
+    path.write_bytes(text)
+    refused(DataError, message, read_volume, str(path))
+
+
+@pytest.mark.parametrize(
     ("old", "new", "message"),
     [
         (b'WholeExtent="0 4 0 3 0 2"', b'WholeExtent="0 4000000 0 300000 0 200000"', "cannot hold"),
@@ -251,3 +269,67 @@ def test_slc_as_vtk_reads_it(tmp_path: Path, coding: int) -> None:
     np.testing.assert_array_equal(volume.data.ravel(), theirs)
     assert volume.spacing == reader.GetOutput().GetSpacing() == (0.5, 1, 2)
     assert isinstance(volume.data, np.memmap) == (coding == 0)
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        (slc([b"3 X\x7f\x01\0"] * 3), "plane 0 of 3 is damaged"),  # a run past the plane's end
+        (slc([b"3 X\xff\x01\x02"] * 3), "plane 0 of 3 is damaged"),  # literals past the data's end
+        (slc([b"3 X\x05\x01\0"] * 3), "plane 0 of 3 is damaged"),  # too few voxels
+        (slc([b"3 X\x14\x01\0"] * 2), "plane 2 of 3 has no size"),
+        (slc([], dims="99999 99999 99999"), "cannot hold"),
+        (slc([bytes(59)], coding=0), "the file has"),
+    ],
+)
+def test_slc_lies(tmp_path: Path, body: bytes, message: str) -> None:
+    path = tmp_path / "v.slc"
+    path.write_bytes(body)
+    refused(DataError, message, read_volume, str(path))
+
+
+def write_tiff(path: Path, values: np.ndarray, samples: int = 1) -> str:
+    """A plain little-endian TIFF stack (z, y, x[, c]) of any type."""
+    kind = {"u": 1, "i": 2, "f": 3}[values.dtype.kind]
+    blob, pages = b"II*\0" + bytes(4), []
+    for page in values:
+        pages.append(len(blob))
+        blob += page.astype(values.dtype.newbyteorder("<")).tobytes()
+        blob += bytes(len(blob) % 2)
+    link = 4
+    for page, strip in zip(values, pages, strict=True):
+        blob = blob[:link] + struct.pack("<I", len(blob)) + blob[link + 4 :]
+        extra = len(blob) + 2 + 10 * 12 + 4
+        bits = values.dtype.itemsize * 8
+        tags = [
+            *((256, 4, 1, page.shape[1]), (257, 4, 1, page.shape[0])),
+            (258, 3, samples, bits if samples == 1 else extra),
+            *((259, 3, 1, 1), (262, 3, 1, 1 if samples == 1 else 2), (273, 4, 1, strip), (277, 3, 1, samples)),
+            *((278, 4, 1, page.shape[0]), (279, 4, 1, page.nbytes)),
+            (339, 3, samples, kind if samples == 1 else extra + 2 * samples),
+        ]
+        blob += struct.pack("<H", 10) + b"".join(struct.pack("<HHII", *t) for t in tags)
+        link = len(blob)
+        blob += (
+            bytes(4) + struct.pack(f"<{samples}H", *[bits] * samples) + struct.pack(f"<{samples}H", *[kind] * samples)
+        )
+    path.write_bytes(blob)
+    return str(path)
+
+
+def test_tiff_lies(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "v.tif"
+    good = Path(write_tiff(path, VALUES.astype("u2"))).read_bytes()
+    width = struct.pack("<HHII", 256, 4, 1, 5)
+    assert good.count(width) == 3
+    cases = {
+        good.replace(width, struct.pack("<HHII", 256, 4, 1, 6), 1): "2 series: 0 .*axes YX.*; 1 ",
+        good.replace(width, struct.pack("<HHII", 256, 4, 1, 2_000_000_000)): "cannot hold",
+        good[:-30]: "cut short",
+        good[:6]: "cut short",
+        b"II*\0" + bytes(4): "without pages",
+    }
+    for body, message in cases.items():
+        path.write_bytes(body)
+        refused(VvgtError, message, read_volume, str(path))
+    assert capfd.readouterr() == ("", "")
