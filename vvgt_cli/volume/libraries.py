@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, VvgtError
+from vvgt_cli.errors import DataError, VvgtError, pip_install
 
 
 def need(module: str, extra: str, source: str, what: str) -> Any:
-    """Import a module that an extra installs; raise DataError, which names the extra, if it is missing."""
+    """Import a module that an extra installs; raise DataError, with the command that installs it, if it is missing."""
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise DataError(f"{source}: {what} needs {module} ({error}); try: pip install 'vvgt[{extra}]'") from error
+        raise DataError(f"{source}: {what} needs {module} ({error}); try: {pip_install(extra)}") from error
 
 
 @contextmanager
