@@ -4,12 +4,14 @@
 
 `grid_db`: dB over RGB of the ray-cast view (test view 3, 3 x 3 rays a pixel) against the picture of paths; `noise_db`:
 of the latter, from its halves; `light_seconds`: processor time of the grid. Repeat `--paths` for a curve.
+With `--pictures DIR` no rows, but a JPEG a scene: unlit, under a headlight, and under the first sky.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import click
@@ -44,6 +46,20 @@ def measure(scene: Scene, name: str, size: int, counts: tuple[int, ...]) -> Iter
         yield {"paths": paths, "grid_db": decibels(image - traced), "noise_db": noise, "light_seconds": spent}
 
 
+def picture(scene: Scene, sky: str, size: int, target: Path) -> None:
+    """Draw test view 4 unlit, under a headlight, and under a sky whose viewer is the camera, side by side."""
+    from PIL import Image
+
+    camera = default_views("test", size=size)[4]
+    toward = scene.volume.axes @ camera.position
+    lights = [
+        LightOptions(names).lighting(None, None) for names in (("headlight",), (sky, f"{toward[0]},{toward[1]},0"))
+    ]
+    lit = [scene, *(scene.lit(light) for light in lights if light)]
+    sheet = np.hstack([render_view(one, camera, RenderSettings(samples=3))[..., :3] for one in lit])
+    Image.fromarray(np.rint(255 * sheet.clip(0, 1)).astype(np.uint8)).save(target, quality=88)
+
+
 @click.command(help=__doc__)
 @click.argument("places", nargs=3, type=click.Path(exists=True))
 @click.option("--scene", "scenes", multiple=True)
@@ -51,18 +67,23 @@ def measure(scene: Scene, name: str, size: int, counts: tuple[int, ...]) -> Iter
 @click.option("--sky", "skies", multiple=True, default=SKIES)
 @click.option("--paths", type=int, multiple=True, default=(512,))
 @click.option("-o", "--output", type=click.Path())
+@click.option("--pictures", type=click.Path(file_okay=False))
 def main(
     places: tuple[str, str, str], scenes: tuple[str, ...], size: int, skies: tuple[str, ...], paths: tuple[int, ...],
-    output: str | None,
+    output: str | None, pictures: str | None,
 ) -> None:  # fmt: skip
-    rows = []
+    rows: list[dict[str, Any]] = []
     for name, source in read_scenes(*places, scenes or None):
+        if pictures:
+            picture(source.scene(), skies[0], size, Path(pictures) / f"{name}-{skies[0]}.jpg")
+            continue
         for sky in skies:
             for row in measure(source.scene(), sky, size, paths):
                 rows.append({"scene": name, "sky": sky, **row, "size": size, "commit": commit()})
                 rows[-1]["machine"] = machine().split(", load")[0]
                 print(rows[-1], flush=True)
-    write_rows(output, rows)
+    if rows:
+        write_rows(output, rows)
 
 
 if __name__ == "__main__":
