@@ -217,23 +217,28 @@ def test_pages_that_draw_by_the_rule_agree(bench, scenes, monkeypatch):
             {},
         ),
     )
-    call(module.main, f"SCENES -o a.csv --pictures pictures --gaussians 500 --screen {SIZE}", scenes)
+    call(module.main, f"SCENES -o a.csv --pictures pictures --gaussians 500 --size {SIZE}", scenes)
     rows = list(csv.DictReader(Path("a.csv").read_text().splitlines()))
     assert all(20 < float(row["command"]) == float(row["page"]) < float(row["agreement"]) for row in rows)
-    viewers = bench("viewers", SIZE=SIZE)
+    viewers, shot = bench("viewers", SIZE=SIZE), []
 
     def shoot(viewer, file, cameras, size, folder, options):
+        shot.append(file)
         drawn = read_splats(file)[0]
-        return [viewers.render(drawn, one, rule=viewers.VIEWERS[viewer][0])[..., :3] for one in cameras]
+        return [viewers.render(drawn, one, rule=viewers.VIEWERS[viewer].rule)[..., :3] for one in cameras]
 
     monkeypatch.setattr(viewers, "shoot", shoot)
+    monkeypatch.setattr(viewers, "version", lambda viewer: "1.0")
     block = read_volume("example:blob:12").data * 0
     block[7:11, 2:9, 1:5] = 1  # at one corner, with three different edges
     write_nrrd(Path("block.nrrd"), Volume(block, (1, 1, 1), space="RAS"))
     words = "block.nrrd --tf shells.json --max-gaussians 300 --steps 0 --pictures p --viewer three --format .ply"
-    (row,) = (line.split(",") for line in call(viewers.main, words, scenes).splitlines()[:1])
-    assert float(row[2]) > 20
-    assert float(row[4]) > 50
+    unlit, lit, *table = call(viewers.main, words, scenes).splitlines()
+    assert float(unlit.removeprefix("three,.ply,unlit,")) > 50
+    assert lit.endswith(",right")
+    assert "| three.js 1.0 |" in table[2]
+    assert call(viewers.main, words, scenes).splitlines() == [unlit, lit, *table]
+    assert len(shot) == 2  # unlit and lit, each once
 
 
 def test_reports(bench, scenes, monkeypatch):

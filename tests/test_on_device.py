@@ -124,7 +124,7 @@ def test_a_device_that_fails_in_a_step_says_so(monkeypatch):
 def test_a_machine_without_a_gpu_is_told_what_is_missing(vvgt, monkeypatch, tmp_path):
     monkeypatch.setattr(device, "missing", lambda: ["numba-cuda"])
     convert = "convert", "example:frog", "-o", tmp_path / "f.ply", "--device"
-    assert "--device cuda needs numba-cuda: pip install 'vvgt[cuda]'" in vvgt(*convert, "cuda").error
+    assert "--device cuda needs numba-cuda: pip install 'numba-cuda[cu13]>=" in vvgt(*convert, "cuda").error
     assert device.chosen("auto") == "cpu"
     assert "none that could be used: numba-cuda not installed" in vvgt("info", "--machine").out.decode()
     assert "expected a file, or --machine" in vvgt("info").error

@@ -24,7 +24,7 @@ from vvgt_cli.conversion.index import FRAMES, frame_facts, is_pattern, put_name
 from vvgt_cli.conversion.manifest import Shard
 from vvgt_cli.conversion.recolored import FunctionRequest, recolored
 from vvgt_cli.conversion.request import ConvertRequest
-from vvgt_cli.errors import DataError, SeveralSteps, UsageError
+from vvgt_cli.errors import DataError, SeveralSteps, UsageError, pip_install
 from vvgt_cli.field.blocked import Blocked
 from vvgt_cli.field.grid import Boxes
 from vvgt_cli.field.open import FieldNeeds, automatic, blocked, store_beside
@@ -464,7 +464,7 @@ def _ffmpeg(source: str) -> Any:
         import imageio_ffmpeg
     except ImportError as error:
         raise DataError(
-            f"{source}: .mp4 needs imageio_ffmpeg ({error}); try: pip install 'vvgt[share]', or .gif"
+            f"{source}: .mp4 needs imageio_ffmpeg ({error}); try: {pip_install('share')}, or .gif"
         ) from None
     return imageio_ffmpeg
 
