@@ -13,7 +13,6 @@ from tests.refused import refused
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume import ReadOptions, read_volume
 from vvgt_cli.volume.registry import contents
-from vvgt_cli.volume.vtk import child as vtk_child
 
 BOUNDS = [(X[0], X[-1]), (Y[0], Y[-1]), (Z[0], Z[-1])]
 
@@ -115,15 +114,6 @@ def test_components_and_choices(tmp_path: Path) -> None:
         (ReadOptions(array="ramp", dtype="uint8"), "leave out --dtype"),
     ):
         refused(UsageError, message, read_volume, str(path), options)
-
-
-@pytest.mark.parametrize("suffix", ["vtr", "vts", "vtu", "vtk"])
-def test_what_brings_vtk_down_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str) -> None:
-    path = tmp_path / f"v.{suffix}"
-    {"vtr": rectilinear, "vts": structured, "vtu": tetrahedra, "vtk": tetrahedra}[suffix]().save(path)
-    code = "import os, vvgt_cli.volume.vtk.child as c; c.answer = lambda request: os.kill(os.getpid(), 11); c.main()"
-    monkeypatch.setattr(vtk_child, "START", code)
-    refused(DataError, r"VTK's reader of VTK files broke down \(SIGSEGV\)", read_volume, str(path))
 
 
 def test_a_warning_of_vtk_is_a_message(tmp_path: Path) -> None:

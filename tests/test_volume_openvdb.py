@@ -87,16 +87,6 @@ def test_every_grid_is_equal_to_the_last_bit(folder: Path, case: Case) -> None:
         np.testing.assert_array_equal(np.asarray(volume.data), magnitude(np.moveaxis(expected, -1, 0)))
 
 
-def test_the_fixtures_hold_what_is_claimed() -> None:
-    found = cases()
-    codecs = {"none.vdb", "none_mask.vdb", "zip.vdb", "zip_mask.vdb", "blosc.vdb", "blosc_mask.vdb"}
-    kinds = {
-        "float", "half", "double", "half double", "int32", "int64", "bool", "vec3s", "half vec3s", "vec3d", "vec3i",
-    }  # fmt: skip
-    assert {(c.file, c.grid) for c in found} >= {(codec, kind) for codec in codecs for kind in kinds}
-    assert ARCHIVE.stat().st_size < 600_000
-
-
 def test_slabs_are_the_parts_of_the_whole(folder: Path) -> None:
     for grid in ("tiles", "root"):
         lazy, whole = (
@@ -129,18 +119,6 @@ def test_a_grid_that_is_walked_through_is_not_laid_out(folder: Path) -> None:
     assert isinstance(volume.data, Stored)
     numbers = statistics(volume)
     assert (numbers.lo, numbers.hi, numbers.histogram.sum()) == (1.5, 4.5, volume.data.size)
-
-
-@pytest.mark.parametrize(
-    ("grid", "direction"),
-    [
-        ("mirrored", (1, 0, 0, 0, -1, 0, 0, 0, 1)),
-        ("turned", (0, -1, 0, 1, 0, 0, 0, 0, 1)),
-        ("affine", (1, 0, 0, 0, 1, 0, 0, 0, 1)),
-    ],
-)
-def test_direction(folder: Path, grid: str, direction: tuple[float, ...]) -> None:
-    assert read_volume(str(folder / "transforms.vdb"), ReadOptions(array=grid)).direction == direction
 
 
 @pytest.mark.parametrize(
@@ -190,14 +168,6 @@ def test_version_225_adds_a_type_of_grid_only(folder: Path, tmp_path: Path) -> N
     np.testing.assert_array_equal(np.asarray(found.data), np.asarray(known.data))
 
 
-def test_a_file_that_was_cut(folder: Path, tmp_path: Path) -> None:
-    data = (folder / "version222.vdb").read_bytes()
-    for size in (9, 30, 100, 1000, 20000, len(data) // 2):
-        (tmp_path / "v.vdb").write_bytes(data[:size])
-        with pytest.raises(DataError, match="check that the file is whole"):
-            read_volume(str(tmp_path / "v.vdb"), ReadOptions(array="bool"))
-
-
 def packed(data: bytes) -> Cursor:
     return Cursor(memoryview(struct.pack("<q", len(data)) + data), "v.vdb")
 
@@ -206,25 +176,6 @@ def test_a_bomb_is_not_unpacked() -> None:
     with pytest.raises(DataError, match="holds 2049 bytes where 2048 are expected"):
         codec.read_block(packed(zlib.compress(bytes(1 << 24))), 2048, codec.ZIP)
     refused(DataError, "damaged ZIP", codec.read_block, packed(b"nonsense"), 2048, codec.ZIP)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"flags": 0x20 | 4}, "expected LZ4"),
-        ({"nbytes": 1 << 30}, "where 64 for 64 are expected|for 64 are expected"),
-        ({"start": 1 << 31}, "leaves its bounds"),
-        ({"blocksize": 1}, "without its table"),
-    ],
-)
-def test_a_blosc_block_that_lies(change: dict, message: str) -> None:
-    stream = bytes([0x1F, 7, 1, 0, 44]) + bytes(20)
-    told = {
-        "flags": 0x31, "typesize": 4, "nbytes": 64, "blocksize": 64, "cbytes": 24 + len(stream), "start": 20,
-    } | change  # fmt: skip
-    head = struct.pack("<4B3I", 2, 1, *(told[k] for k in ("flags", "typesize", "nbytes", "blocksize", "cbytes")))
-    data = head + struct.pack("<Ii", told["start"], len(stream)) + stream
-    refused(DataError, message, codec.read_block, packed(data), 64, codec.BLOSC)
 
 
 def test_nanovdb_says_how_to_convert(tmp_path: Path) -> None:

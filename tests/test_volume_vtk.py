@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
 from vtkmodules.vtkCommonDataModel import vtkImageData, vtkStructuredPoints
-from vtkmodules.vtkIOImage import vtkSLCReader, vtkTIFFReader, vtkTIFFWriter
+from vtkmodules.vtkIOImage import vtkSLCReader
 from vtkmodules.vtkIOLegacy import vtkStructuredPointsReader, vtkStructuredPointsWriter
 from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
 
@@ -315,23 +315,6 @@ def write_tiff(path: Path, values: np.ndarray, samples: int = 1) -> str:
         )
     path.write_bytes(blob)
     return str(path)
-
-
-@pytest.mark.parametrize("code", ["u1", "u2", "f4"])
-def test_tiff_as_vtk_writes_and_reads_it(tmp_path: Path, code: str) -> None:
-    data = image()
-    data.GetPointData().SetScalars(numpy_to_vtk(VALUES.astype(code).ravel()))
-    writer = vtkTIFFWriter()
-    writer.SetInputData(data)
-    writer.SetFileName(str(tmp_path / "v.tiff"))
-    writer.SetCompressionToPackBits()
-    writer.Write()
-    np.testing.assert_array_equal(read_volume(str(tmp_path / "v.tiff")).data, VALUES)
-    reader = vtkTIFFReader()
-    reader.SetFileName(write_tiff(tmp_path / "w.tif", VALUES.astype(code)))
-    reader.Update()
-    theirs = vtk_to_numpy(reader.GetOutput().GetPointData().GetScalars())
-    np.testing.assert_array_equal(read_volume(str(tmp_path / "w.tif")).data.ravel(), theirs)
 
 
 def test_tiff_lies(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
