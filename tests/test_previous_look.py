@@ -104,7 +104,7 @@ def test_another_light_and_another_size(session, earlier):
         (OUTSIDE, {}, "differs too much"),
         (SHELL, {"max_gaussians": 300}, "Gaussians"),
         (SHELL, {"steps": 0}, "no steps"),
-        (vvgt.Look(SHELL, light=vvgt.LightOptions(("above",), shadows=True)), {}, "shadows"),
+        (vvgt.Look(SHELL, light=vvgt.LightOptions(("sun",))), {}, "a sky"),
     ],
 )
 def test_what_is_too_far_is_converted_by_itself(session, earlier, look, goal, why):

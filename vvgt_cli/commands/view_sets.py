@@ -195,7 +195,7 @@ def open_looks(
         )
     sources = [source for source, _ in opened]
     lit = [source for source in sources if source.lighting is not None]
-    lit.sort(key=lambda source: source.lighting is not None and source.lighting.attenuated)
+    lit.sort(key=lambda source: source.lighting is not None and source.lighting.sky is not None)
     kernels = (lit or sources)[-1].kernels(VIEWS)
     run.compile(for_blocks(kernels) if options else kernels, sources[0].kernel_type())
     return opened
