@@ -19,10 +19,10 @@ import numpy as np
 from dvr_scenes import commit, read_scenes, write_rows
 from floors import machine
 
+from tests.paths_twin import path_view
 from vvgt_cli.cameras import default_views
 from vvgt_cli.dvr import RenderSettings, Scene, render_view
 from vvgt_cli.dvr.sky import sky_of
-from vvgt_cli.dvr.traced import path_view
 from vvgt_cli.look.lighting import SKIES, LightOptions
 
 

@@ -64,3 +64,29 @@ def arriving(scene, light, points, rng, bounces=64, g=0.0):
         alive = np.setdiff1d(alive, gone)
         weight[alive] *= optics_at(scene, at[alive])[1] ** GAMMA
     return out
+
+
+def path_view(matter, sky, half, camera, samples, seed=0):
+    """One view (height, width, 4), premultiplied RGBA, path-traced from the eye with the package's kernels.
+
+    ``matter`` in the scene's own voxels, ``half`` (3,) of `Scene`; ``samples`` paths a pixel, at random places of it.
+    """
+    pixels, rng = camera.height * camera.width, np.random.default_rng(seed)
+    y, x = np.divmod(np.arange(pixels), camera.width)
+    color, hits = np.zeros((3, pixels)), np.zeros(pixels)
+    together = max((1 << 18) // pixels, 1)
+    for begin in range(0, samples, together):
+        count = min(together, samples - begin)
+        place = np.stack([x, y, np.ones(pixels)], axis=1)[None] + rng.random((count, pixels, 3)) * [1, 1, 0]
+        local = (place - [camera.cx, camera.cy, 0]) / [camera.fx, camera.fy, 1]
+        along = (local / np.linalg.norm(local, axis=2, keepdims=True)).reshape(-1, 3) @ camera.rotation
+        eye = np.broadcast_to((camera.position + half) / matter.step - 0.5, along.shape)
+        found = matter.scattered(np.concatenate([eye, along], axis=1), seed + 2 * begin)
+        one = np.ones(len(found), np.int64)
+        light = matter.gathered(sky, seed + 2 * begin + 1, found[:, :6], 0 * one, one)
+        pixel = found[:, 6].astype(np.int64) % pixels
+        hits += np.bincount(pixel, minlength=pixels)
+        for c in range(3):
+            color[c] += np.bincount(pixel, light[:, c] * light[:, 4 + c], pixels)
+    shown = np.minimum((color / np.maximum(hits, 1)) ** (1 / GAMMA), 1) * hits / samples
+    return np.concatenate([shown, hits[None] / samples]).T.reshape(camera.height, camera.width, 4)

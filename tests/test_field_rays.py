@@ -18,7 +18,7 @@ from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.field import Picture
 from vvgt_cli.field.grid import Boxes, piece_edge
 from vvgt_cli.field.open import FieldNeeds, blocked
-from vvgt_cli.field.rays import KernelBundle, front_to_back, meeting, pieces_of
+from vvgt_cli.field.rays import Bundle, front_to_back, meeting, pieces_of
 from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import read_ply
@@ -133,7 +133,7 @@ def cast_of(camera, half=1.0, step=0.02):
     eye, basis, lens = camera_arrays(BoxFrame(np.full(3, half), np.full(3, step)), camera)
     rows, columns = np.indices((camera.height, camera.width))
     pixels = np.stack([columns, rows], axis=-1).reshape(-1, 2)
-    return KernelBundle(eye, basis, lens, 0.5, pixels, np.zeros((1, 2)))
+    return Bundle(eye, basis, lens, 0.5, pixels, np.zeros((1, 2)))
 
 
 def test_a_piece_casts_the_rays_that_may_meet_it_and_no_others(tmp_path, monkeypatch):

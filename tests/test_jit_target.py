@@ -6,10 +6,10 @@ from tests.processes import python
 
 
 def test_helpers_are_not_called_from_python():
-    from vvgt_cli.splat.kernel import to_camera
+    from vvgt_cli.splat.kernel import unit_quaternion
 
     with pytest.raises(TypeError, match="kernels only"):
-        to_camera(1, 2, 3, 4)
+        unit_quaternion(1, 2)
 
 
 def test_vectors_are_wide_where_that_costs_no_clock(monkeypatch):

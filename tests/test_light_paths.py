@@ -12,7 +12,7 @@ from tests.test_light import blob, camera, function
 from vvgt_cli.dvr import RenderSettings, Scene, render_view, render_view_reference
 from vvgt_cli.dvr.light import sphere
 from vvgt_cli.dvr.sky import COLUMNS, ROWS, Sky, directions, sky_of
-from vvgt_cli.dvr.traced import lines, path_view
+from vvgt_cli.dvr.traced import lines
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.open import FieldNeeds, _settings
 from vvgt_cli.field.source import SourceRequest
@@ -176,7 +176,7 @@ def test_views_show_the_light_of_paths():
     lit, view = scene.lit(lighting), camera(24)
     sky = sky_of("studio", np.array(lighting.directions[0]), scene.volume.axes)
     image = render_view(lit, view, RenderSettings(samples=3))
-    traced = path_view(scene.scattering(), sky, scene.half, view, 200)
+    traced = paths_twin.path_view(scene.scattering(), sky, scene.half, view, 200)
     error = (image - traced)[..., :3]
     assert -10 * math.log10((error**2).mean()) > 33
     twin = render_view_reference(lit, camera(12), step=1 / 16)

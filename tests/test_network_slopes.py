@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from network_models import scene
 
-from tests.splat_twin import render_backward_reference
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.frames import rotations
 from vvgt_cli.network.config import SLOPES
-from vvgt_cli.network.prepare import STEP, own_axes_gradients, pack, slope_rows, unpack
-from vvgt_cli.splat import render, render_reference
+from vvgt_cli.network.prepare import STEP, pack, slope_rows, unpack
+from vvgt_cli.splat import project, render, render_reference
+from vvgt_cli.splat.render import moments, step_slopes
 
 
 def stepped(g, step):
@@ -31,11 +31,9 @@ def stepped(g, step):
 def test_gradients_in_the_own_frame_against_differences(columns):
     gaussians, cameras, _ = scene(count=12, views=1, seed=4)
     gaussians = unpack(pack(gaussians))
-    slope = np.random.default_rng(0).normal(size=(32, 32, 4))
-    twin = render_backward_reference(gaussians, cameras[0], slope)
-    fields = [twin[name] for name in ("means", "log_scales", "quaternions", "opacity_logits", "colors")]
-    scales = np.exp(gaussians.log_scales)
-    found = own_axes_gradients(gaussians.quaternions, rotations(gaussians.quaternions), scales, fields)
+    slope, projection = np.random.default_rng(0).normal(size=(32, 32, 4)), project(gaussians, cameras[0])
+    pairs = moments(projection, gaussians.colors, render(gaussians, cameras[0]), slope)
+    found = step_slopes(gaussians, cameras[0], projection, pairs, gaussians.colors)
     assert found.shape == (12, STEP)
     step = np.zeros((12, STEP))
     step[:, slice(*columns)] = np.random.default_rng(1).normal(size=(12, columns[1] - columns[0]))

@@ -25,6 +25,11 @@ class Blocks:
     height: int
     numbers: np.ndarray
 
+    @classmethod
+    def whole(cls, width: int, height: int) -> Blocks:
+        """Return all blocks of a picture, those that reach beyond it too."""
+        return cls(width, height, np.arange(-(-width // BLOCK) * -(-height // BLOCK)))
+
     def mask(self) -> np.ndarray:
         """Return the mask (height, width) of the blocks' pixels."""
         rows, across = -(-self.height // BLOCK), -(-self.width // BLOCK)

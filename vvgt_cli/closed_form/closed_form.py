@@ -16,7 +16,7 @@ from vvgt_cli.closed_form.pyramid import Pyramid, Tile
 from vvgt_cli.closed_form.samples import visible_voxels
 from vvgt_cli.closed_form.shape import ROUND, STYLES, SurfaceStyle
 from vvgt_cli.closed_form.surface_offset import opaque_field
-from vvgt_cli.closed_form.tree import Leaves, Scores, Tree, leaves_of, select, split, split_score, value_score
+from vvgt_cli.closed_form.tree import Leaves, Tree, leaves_of, select, split, split_score, value_score
 from vvgt_cli.closed_form.visibility import visibility
 from vvgt_cli.dvr import BoxFrame, Scene
 from vvgt_cli.gaussians import INRIA, Gaussians, Rule
@@ -43,7 +43,7 @@ TWICE_EVERY = 6  # of so many views one counts as seen at twice its size when co
 
 @dataclass(frozen=True, kw_only=True)
 class ClosedForm(Pyramid):
-    """A pyramid of one tile in memory, ready to be cut for any budget.
+    """A pyramid in memory, all of it one tile, ready to be cut for any budget.
 
     Attributes:
         whole: the tile.
@@ -60,24 +60,9 @@ class ClosedForm(Pyramid):
         """Moments of every cell that some view sees."""
         return self.whole.tree
 
-    def roots(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Implement `Pyramid.roots`."""
-        place = np.zeros((min(len(self.tree), 1), 3), np.int32)
-        return place, self.tree.edges[-1], self.tree.moments[-1:], self.tree.largest[-1:]
-
-    def tile(self, row: int) -> Tile:
-        """Implement `Pyramid.tile`."""
-        return self.whole
-
-    def scores_of(self, row: int) -> Scores:
-        """Implement `Pyramid.scores_of`."""
-        return Scores.of(self.tree, split_score(self.tree))
-
     def gaussians(self, style: SurfaceStyle = ROUND) -> Gaussians:
         """Return Gaussians of the cells that the moments alone choose."""
-        cuts = self.cuts(0, len(self), np.array([[self.threshold(self.budget)]]), least=False)
-        nothing = self.shaded(leaves_of(self.tree, np.empty(0, np.int64)), self.whole)
-        return super().gaussians_of(next(cuts, [nothing])[0], style)
+        return self.gaussians_of(leaves_of(self.tree, select(self.tree, self.budget)), style)
 
     def cells_of_values(self) -> Leaves:
         """Return cells for any function: those of `tree.value_score`."""

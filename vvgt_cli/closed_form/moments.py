@@ -16,6 +16,7 @@ import numpy as np
 from vvgt_cli.closed_form.cell_kernels import morton_codes
 from vvgt_cli.closed_form.columns import MASS, MOMENTS
 from vvgt_cli.closed_form.quadrature import block_moments, compact
+from vvgt_cli.dvr.bricks import visible_blocks
 from vvgt_cli.dvr.layout import BRICK, Optics, Texels, Voxels
 from vvgt_cli.dvr.scene import Scene
 
@@ -69,7 +70,8 @@ def base_cells(
     ``progress`` is called with the completed share.
     """
     block, _ = blocks(exponent)
-    origins = _active_blocks(scene, block)
+    shape = -(-np.array(scene.values.shape[::-1]) // block)
+    origins = visible_blocks(scene.values, np.zeros(3), block, shape, scene.optics) * block
     index, moments = region_cells(Region.whole(scene), origins, exponent, points_per_voxel, progress)
     return Cells(index, moments, 2.0**exponent * scene.step, exponent)
 
@@ -190,16 +192,3 @@ def cell_moments(scene: Scene, corners: np.ndarray, edge: np.ndarray) -> np.ndar
     at = np.ascontiguousarray(corners, np.float64)
     _integrate(Region.whole(scene), at, points, child, out)
     return out.reshape(len(corners), 8, MOMENTS)
-
-
-def _active_blocks(scene: Scene, block: np.ndarray) -> np.ndarray:
-    """Return origins (n, 3) in voxels (x, y, z) of the blocks that hold a brick with extinction, in (z, y, x) order."""
-    mask = scene.empty == 0
-    for axis in range(3):  # a block's first half voxel interpolates with the brick before it
-        ahead = [slice(None)] * 3
-        behind = [slice(None)] * 3
-        ahead[axis], behind[axis] = slice(1, None), slice(None, -1)
-        mask[tuple(ahead)] |= mask[tuple(behind)].copy()
-    bricks = np.argwhere(mask)[:, ::-1]  # (x, y, z)
-    result: np.ndarray = np.unique((bricks * BRICK // block)[:, ::-1], axis=0)[:, ::-1] * block
-    return result

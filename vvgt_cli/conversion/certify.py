@@ -43,7 +43,7 @@ def with_certificate(
     values = rounded_error(ply, gaussians, field)
     found = Certificate(
         volume=ply.title or field.source.title,
-        sha256=field.digest(),
+        sha256=field.digest,
         look=field.source.shown_as(),
         size=fit.screen,
         rule=fit.rule,
@@ -157,7 +157,7 @@ def verify(
         field.views, gaussians, certificate.size, RenderSettings(), rule=certificate.rule, perceptual=False,
         only=PREVIEW_VIEWS,
     )  # fmt: skip
-    digests = certificate.sha256, None if certificate.sha256 is None else field.digest()
+    digests = certificate.sha256, None if certificate.sha256 is None else field.digest
     same = None if None in digests else digests[0] == digests[1]
     recorded = certificate.live_psnr if looked_up and certificate.live_psnr is not None else certificate.psnr
     own = certificate.values_psnr

@@ -152,4 +152,4 @@ def _same_volume(field: Field, other: Field) -> bool:
     if first is second:
         return True
     there = first.dims == second.dims and np.array_equal(first.affine, second.affine)
-    return there and field.digest() is not None and field.digest() == other.digest()
+    return there and field.digest is not None and field.digest == other.digest

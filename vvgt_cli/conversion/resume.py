@@ -122,7 +122,7 @@ def checkpoint_of(folder: str | None, field: Field, fit: FitOptions, limits: Lim
     source = field.source
     depends = {
         "version": VERSION,
-        "volume": digest(field.digest(), source.volume.name, source.volume.dims, source.volume.affine),
+        "volume": digest(field.digest, source.volume.name, source.volume.dims, source.volume.affine),
         "function": source.look(),
         "opacity_unit_distance": source.unit_distance,
         "light": None if source.lighting is None else source.lighting.key(),

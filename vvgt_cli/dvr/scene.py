@@ -132,7 +132,7 @@ class Scene:
 
         frame = volume.unit_frame()
         grid *= np.float32(1 / frame.scale)
-        values = _read_only(grid[..., 3], grid.dtype)
+        values = read_only(grid[..., 3], grid.dtype)
         optics = Optics.linear(float(values.max()))
         empty = bricks.empty_distance(bricks.brick_ranges(values), optics)
         half, step = np.array(frame.half), np.array(frame.step)
@@ -160,16 +160,8 @@ def kernel_values(volume: Volume) -> tuple[np.ndarray, float, float]:
     that float32 cannot hold (32-bit integers and up, doubles) are shifted and scaled in float64 by slabs, so that
     ranges of 1e-30 and 1e30 keep 24 bits. NaN stays, infinities stay or become NaN: neither is drawn.
     """
-    data = volume.data
-    if data.dtype == np.bool_:
-        data = data.view(np.uint8)
-    rule = kernel_rule(volume, lambda: _finite_range(data))
-    if rule.half_width is None and not rule.raised:
-        return _read_only(data, rule.dtype), rule.slope, rule.intercept
-    out = np.empty(data.shape, rule.dtype)
-    for z in range(len(data)):
-        out[z] = rule.apply(data[z])
-    return _read_only(out, out.dtype), rule.slope, rule.intercept
+    rule = kernel_rule(volume, lambda: _finite_range(volume.data))
+    return rule.laid_out(volume.data), rule.slope, rule.intercept
 
 
 @dataclass(frozen=True)
@@ -196,11 +188,19 @@ class KernelRule:
             raised: np.ndarray = np.ascontiguousarray(stored).view(np.uint8) ^ np.uint8(128)
             return raised
         if self.half_width is None:
-            stored = stored.view(np.uint8) if stored.dtype == np.bool_ else stored
             return stored.astype(self.dtype, copy=False)
         with np.errstate(invalid="ignore", over="ignore"):
             result: np.ndarray = ((stored.astype(np.float64) / 2 - self.lo / 2) / self.half_width).astype(np.float32)
         return result
+
+    def laid_out(self, stored: np.ndarray) -> np.ndarray:
+        """Return `apply` of stored values (nz, ny, nx), read-only, slab by slab; a view where they are that already."""
+        if self.half_width is None and not self.raised:
+            return read_only(stored.view(np.uint8) if stored.dtype == np.bool_ else stored, self.dtype)
+        out = np.empty(stored.shape, self.dtype)
+        for z, plane in enumerate(stored):  # the intermediate is float64
+            out[z] = self.apply(plane)
+        return read_only(out, out.dtype)
 
 
 def kernel_rule(volume: Volume, limits: Callable[[], tuple[float, float]]) -> KernelRule:
@@ -227,7 +227,7 @@ def kernel_type(volume: Volume) -> str:
     return kernel_rule(volume, lambda: (0.0, 1.0)).dtype.name
 
 
-def _read_only(data: np.ndarray, dtype: np.dtype) -> np.ndarray:
+def read_only(data: np.ndarray, dtype: np.dtype) -> np.ndarray:
     """Return ``data`` read-only, aligned, C-contiguous, of ``dtype``; copied (slab by slab) only where it is not."""
     if data.dtype == dtype and data.flags.c_contiguous and data.flags.aligned:
         out = data.view(np.ndarray)

@@ -1,4 +1,4 @@
-"""Light along traced paths (docs/light.md): what arrives where views see matter, on a grid; and whole pictures."""
+"""Light along traced paths (docs/light.md): what arrives where views see matter, on a grid."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera
 from vvgt_cli.dvr.layout import Optics, Texels, Voxels, corners
 from vvgt_cli.dvr.sky import Sky
 
@@ -202,39 +201,3 @@ def _filtered(at: np.ndarray, total: np.ndarray, begun: np.ndarray, grid: Sequen
     share = np.where(sums[4] > 0, differs / np.maximum(differs + 2 * noise, 1e-30), 0)
     out = below + share[:, None] * (mean - below)
     return out.reshape(*grid, 3)
-
-
-def path_view(
-    matter: Scattering, sky: Sky, half: np.ndarray, camera: Camera, samples: int, seed: int = 0
-) -> np.ndarray:
-    """Return one view (height, width, 4) float64, premultiplied RGBA, path-traced from the eye.
-
-    Args:
-        matter: what scatters, in the scene's own voxels.
-        sky: where light comes from.
-        half: (3,) half extents of the box, as of `Scene`.
-        camera: in the box frame.
-        samples: paths a pixel, at random places of it.
-        seed: of their numbers.
-    """
-    from vvgt_cli.dvr.paths import GAMMA
-
-    pixels, rng = camera.height * camera.width, np.random.default_rng(seed)
-    y, x = np.divmod(np.arange(pixels), camera.width)
-    color, hits = np.zeros((3, pixels)), np.zeros(pixels)
-    together = max(RAYS // pixels, 1)
-    for begin in range(0, samples, together):
-        count = min(together, samples - begin)
-        place = np.stack([x, y, np.ones(pixels)], axis=1)[None] + rng.random((count, pixels, 3)) * [1, 1, 0]
-        local = (place - [camera.cx, camera.cy, 0]) / [camera.fx, camera.fy, 1]
-        along = (local / np.linalg.norm(local, axis=2, keepdims=True)).reshape(-1, 3) @ camera.rotation
-        eye = np.broadcast_to((camera.position + half) / matter.step - 0.5, along.shape)
-        found = matter.scattered(np.concatenate([eye, along], axis=1), seed + 2 * begin)
-        one = np.ones(len(found), np.int64)
-        light = matter.gathered(sky, seed + 2 * begin + 1, found[:, :6], 0 * one, one)
-        pixel = found[:, 6].astype(np.int64) % pixels
-        hits += np.bincount(pixel, minlength=pixels)
-        for c in range(3):
-            color[c] += np.bincount(pixel, light[:, c] * light[:, 4 + c], pixels)
-    shown = np.minimum((color / np.maximum(hits, 1)) ** (1 / GAMMA), 1) * hits / samples
-    return np.concatenate([shown, hits[None] / samples]).T.reshape(camera.height, camera.width, 4)

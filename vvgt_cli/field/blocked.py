@@ -12,13 +12,13 @@ import numpy as np
 from vvgt_cli.cameras import Blocks, Camera, default_views, pixel_width
 from vvgt_cli.closed_form.columns import MOMENTS
 from vvgt_cli.dvr.layout import Light
-from vvgt_cli.dvr.render import BoxFrame, Rays, RenderSettings, first_rays, for_thin, more_rays
+from vvgt_cli.dvr.render import BoxFrame, Rays, RenderSettings, camera_arrays, first_rays, for_thin, more_rays
 from vvgt_cli.field.block_store import CELLS, BlockStore
 from vvgt_cli.field.cells import CellBlocks, MeanBlocks, PointBlocks, RayBlocks, ValueBlocks
-from vvgt_cli.field.digests import digest, values_digest
+from vvgt_cli.field.digests import digest
 from vvgt_cli.field.field import Field, Picture, ViewRenderer
 from vvgt_cli.field.grid import CellGrid
-from vvgt_cli.field.rays import Bundle, RayFile, composed
+from vvgt_cli.field.rays import LONGEST, Bundle, RayFile, composed
 from vvgt_cli.field.reader import Scalars
 from vvgt_cli.field.runners import Runner, Task
 from vvgt_cli.field.settings import cell_grid
@@ -95,7 +95,7 @@ class Blocked(Field):
         visible: approximate number of voxels with extinction.
         key: digest of everything that the field depends on.
         prepare_look: maps a source of the same volumes to that source with statistics, reader and visible voxels.
-        pictures: rendered or expected pictures, by digest.
+        pictures: rendered pictures, the pixels (n, 4) of their blocks, and expected ones, None; by digest.
         grid: the grid of base cells, once they are integrated.
         renderer: renders its pictures; None selects the field itself.
     """
@@ -165,7 +165,7 @@ class Blocked(Field):
         while blocks(exponents(step, level))[1].max() > 1 << TILE_BITS:
             level += 1  # voxels so thin that a block has too many cells
         grid, todo = self._grid(exponents(step, level)), self._pending()
-        rays = self._file([(one, one.first_pass()) for one in todo], grid) if todo else None
+        rays = self._file([(one, one.first_pass()) for one in todo.values()], grid) if todo else None
         if rays is not None:
             self.run_pass.store.prepare(rays.kind)
         return CellBlocks(self.reader, grid, self.run_pass.store, rays, self.light, self.source.labels_alone)
@@ -197,36 +197,39 @@ class Blocked(Field):
         self.expect([view])
         if self.pictures[view.key][1] is None:
             self._render_pending()
-        image = self.pictures[view.key][1]
-        assert image is not None
-        return image if blocks is None else blocks.image(image)
+        colors = self.pictures[view.key][1]
+        assert colors is not None
+        return view.drawn.image(colors)
 
     def forget(self, picture: Picture) -> None:
         """Implement `ViewRenderer.forget`."""
         self.pictures.pop(picture.key, None)
 
-    def _pending(self) -> list[Drawing]:
-        """Return the pictures that are expected but not rendered."""
-        return [
-            Drawing(key, view.camera, for_thin(view.settings, self.frame, view.camera), view.blocks)
-            for key, (view, made) in self.pictures.items()
-            if made is None
-        ]
+    def _pending(self) -> dict[str, Drawing]:
+        """Return the pictures that are expected but not rendered, by digest."""
+        return {
+            key: Drawing(view.camera, for_thin(view.settings, self.frame, view.camera), view.drawn)
+            for key, (view, colors) in self.pictures.items()
+            if colors is None
+        }
 
     def _file(self, wanted: Sequence[tuple[Drawing, list[Rays]]], grid: CellGrid) -> RayFile:
         """Write the rays that pictures need next to a file."""
         bundles = [
-            Bundle(one.camera, one.settings.step, np.argwhere(mask)[:, ::-1], offsets)
+            Bundle(
+                *camera_arrays(self.frame, one.camera), min(one.settings.step, LONGEST), np.argwhere(mask)[:, ::-1],
+                offsets,
+            )
             for one, rays in wanted
             for offsets, mask, _ in rays
-        ]
-        return RayFile.of(bundles, self.frame, grid.blocks, self.run_pass.store)
+        ]  # fmt: skip
+        return RayFile.of(bundles, grid.blocks, self.run_pass.store)
 
     def _render_pending(self) -> None:
         """Render all expected pictures together, in at most two passes."""
         todo, grid = self._pending(), self.grid or self._grid(np.zeros(3, np.int64))
         for asked in (Drawing.first_pass, Drawing.second_pass):
-            wanted = [(one, rays) for one in todo if (rays := asked(one))]
+            wanted = [(one, rays) for one in todo.values() if (rays := asked(one))]
             if not wanted:
                 continue
             file = self._file(wanted, grid)
@@ -238,9 +241,8 @@ class Blocked(Field):
                 for part in rays:
                     one.add(part, next(seen))
             seen.close()  # closes the mapped files, too
-        for one in todo:
-            image = one.colors if one.blocks is not None else one.image()
-            self.pictures[one.key] = self.pictures[one.key][0], image
+        for key, one in todo.items():
+            self.pictures[key] = self.pictures[key][0], one.colors
 
     def _visible_blocks(self) -> list[int]:
         """Return the blocks with visible cells, or all blocks before the cells are integrated."""
@@ -311,14 +313,6 @@ class Blocked(Field):
         store.open({"shown": key}, ours=True)
         return Blocked(source, reader, replace(self.run_pass, store=store), self.edge, visible, key, self.prepare_look)
 
-    @cached_property
-    def _digest(self) -> str | None:
-        return values_digest([place.volume() for place in self.reader.all_places])
-
-    def digest(self) -> str | None:
-        """Implement `Field.digest`."""
-        return self._digest
-
 
 def _gathered(task: CellBlocks) -> Cells:
     """Return all cells, with normals under light."""
@@ -341,41 +335,34 @@ class Drawing:
     """A partially rendered picture, which stores only the pixels of its blocks.
 
     Attributes:
-        key: digest of the picture.
-        camera, settings, blocks: the fields of `Picture`.
+        camera, settings: the fields of `Picture`.
+        blocks: the blocks to render, all of them of a whole picture.
     """
 
-    key: str
     camera: Camera
     settings: RenderSettings
-    blocks: Blocks | None
+    blocks: Blocks
+
+    @cached_property
+    def mask(self) -> np.ndarray:
+        """Mask (h, w) of the pixels to render."""
+        return self.blocks.mask()
 
     @cached_property
     def colors(self) -> np.ndarray:
-        """Colours (n, 4) float32 of the pixels of `pixel_mask`, row by row."""
-        return np.zeros((int(self.pixel_mask().sum()), 4), np.float32)
-
-    def pixel_mask(self) -> np.ndarray:
-        """Return the mask (h, w) of the pixels to render."""
-        shape = self.camera.height, self.camera.width
-        return np.ones(shape, bool) if self.blocks is None else self.blocks.mask()
-
-    def image(self) -> np.ndarray:
-        """Return the picture (h, w, 4), zero outside the blocks."""
-        whole = np.zeros((self.camera.height, self.camera.width, 4), np.float32)
-        whole[self.pixel_mask()] = self.colors
-        return whole
+        """Colours (n, 4) float32 of these pixels, row by row."""
+        return np.zeros((np.count_nonzero(self.mask), 4), np.float32)
 
     def first_pass(self) -> list[Rays]:
         """Return the rays of the first pass."""
-        return first_rays(self.settings, self.pixel_mask())
+        return first_rays(self.settings, self.mask)
 
     def second_pass(self) -> list[Rays]:
         """Return the rays of the second pass."""
-        return more_rays(self.settings, self.image(), self.pixel_mask())
+        return more_rays(self.settings, self.blocks.image(self.colors), self.mask)
 
     def add(self, rays: Rays, shown: np.ndarray) -> None:
         """Average in the colours that ``rays`` see, (pixels, rays, 4) float64."""
         offsets, mask, known = rays
-        at = mask[self.pixel_mask()]
+        at = mask[self.mask]
         self.colors[at] = (known * self.colors[at] + shown.sum(axis=1)) / (known + len(offsets))

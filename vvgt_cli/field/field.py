@@ -39,6 +39,11 @@ class Picture(NamedTuple):
         numbers = None if self.blocks is None else self.blocks.numbers
         return digest(camera.rotation, camera.translation, lens, self.settings, numbers)
 
+    @property
+    def drawn(self) -> Blocks:
+        """Return its blocks, all of them of a whole picture."""
+        return self.blocks or Blocks.whole(self.camera.width, self.camera.height)
+
 
 class ViewRenderer(Protocol):
     """A renderer of pictures of a volume."""
@@ -87,8 +92,10 @@ class Field(ViewRenderer, Protocol):
     def normals(self, gaussians: Gaussians) -> np.ndarray | None:
         """Return the mean gradient directions (K, 3) around Gaussians of the box frame; None without light."""
 
+    @cached_property
     def digest(self) -> str | None:
-        """Return the SHA-256 of all volumes' values; None if they exceed `LARGEST` bytes."""
+        """SHA-256 of all volumes' values; None if they exceed `LARGEST` bytes."""
+        return values_digest(self.source.volumes)
 
 
 @dataclass
@@ -182,11 +189,3 @@ class Resident(Field):
             source = replace(source, statistics=statistics(source.volume))
         gridded = source.gridded or self.source.gridded
         return Resident.of(source if gridded else replace(source, layout=self.layout), self.device, self.report)
-
-    @cached_property
-    def _digest(self) -> str | None:
-        return values_digest(self.source.volumes)
-
-    def digest(self) -> str | None:
-        """Implement `Field.digest`."""
-        return self._digest

@@ -108,13 +108,24 @@ class OpenedFile:
 class Access:
     """Access to volumes and statistics of their values; here to volumes that are read whole."""
 
+    def __init__(self) -> None:
+        """Begin without statistics; those of the last volume are kept."""
+        self._last: tuple[Volume, Statistics] | None = None
+
     def open(self, source: str | Volume | OpenedFile, read: ReadOptions) -> OpenedFile:
         """Open a file, or content that is already open."""
-        return open_content(source, read) if isinstance(source, str) else content_of(source).loaded()
+        if isinstance(source, str):
+            return open_content(source, read)
+        content = content_of(source).loaded()
+        if content is source and content.single_volume:
+            self._last = content.volumes[0], content.statistics
+        return content
 
     def statistics(self, volume: Volume) -> Statistics:
         """Return the statistics of a volume's data values."""
-        return statistics(volume)
+        if self._last is None or self._last[0] is not volume:
+            self._last = volume, statistics(volume)
+        return self._last[1]
 
     def labels(self, volume: Volume) -> list[int]:
         """Return the labels that a volume holds, ascending."""

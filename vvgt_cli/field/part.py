@@ -9,7 +9,7 @@ import numpy as np
 from vvgt_cli.cameras import Blocks, Camera
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.dvr.render import BoxFrame, RenderSettings, camera_arrays, for_thin, tiers
-from vvgt_cli.field.rays import HALO, LIT_HALO, LONGEST, KernelBundle, caster, meeting
+from vvgt_cli.field.rays import HALO, LIT_HALO, LONGEST, Bundle, caster, meeting
 from vvgt_cli.field.reader import Layers, Scalars, VoxelBox
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.frames import rescale
@@ -70,7 +70,7 @@ class VolumePart:
             for offsets, mask, known in rays:
                 row, column = np.nonzero(mask)
                 pixels = np.stack([column, row], axis=1)
-                bundle = KernelBundle(eye, basis, lens, min(settings.step, LONGEST), pixels, offsets)
+                bundle = Bundle(eye, basis, lens, min(settings.step, LONGEST), pixels, offsets)
                 near = meeting(bundle, lo - 0.5, hi - 0.5)
                 sums = np.zeros((len(pixels), 4))
                 sums[near] = cast(bundle, near).sum(axis=1)
@@ -85,7 +85,7 @@ class VolumePart:
         eye, basis, lens = self._arrays(camera)
         column, row = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
         pixels = np.stack([column.ravel(), row.ravel()], axis=1)
-        bundle = KernelBundle(eye, basis, lens, LONGEST, pixels, np.zeros((1, 2)))
+        bundle = Bundle(eye, basis, lens, LONGEST, pixels, np.zeros((1, 2)))
         through = np.ones(len(pixels), np.float32)
         for lo, hi in self._before(eye):
             near = meeting(bundle, lo - 0.5, hi - 0.5)

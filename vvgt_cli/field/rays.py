@@ -15,9 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera
 from vvgt_cli.dvr.layout import Light
-from vvgt_cli.dvr.render import BoxFrame, camera_arrays
 from vvgt_cli.errors import DataError
 from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.digests import digest
@@ -33,23 +31,21 @@ HALO, LIT_HALO = 1, 2  # voxels around a block that are read with it
 
 
 class Bundle(NamedTuple):
-    """Rays of one picture.
+    """Rays of one picture, as kernels take them.
 
     Attributes:
-        camera: camera in the box frame.
-        step: distance between samples in voxels.
+        eye, basis, lens: `camera_arrays` of the camera.
+        step: distance between samples in voxels, at most `LONGEST`.
         pixels: (n, 2) int64 columns and rows.
         offsets: (m, 2) offsets of each pixel's rays from its centre.
     """
 
-    camera: Camera
+    eye: np.ndarray
+    basis: np.ndarray
+    lens: np.ndarray
     step: float
     pixels: np.ndarray
     offsets: np.ndarray
-
-    def __len__(self) -> int:
-        """Return the number of rays."""
-        return len(self.pixels) * len(self.offsets)
 
 
 @dataclass(frozen=True)
@@ -65,13 +61,11 @@ class RayFile:
     kind: str
 
     @classmethod
-    def of(cls, bundles: Sequence[Bundle], frame: BoxFrame, blocks: Boxes, store: BlockStore) -> RayFile:
-        """Write bundles of rays through a volume with this ``frame``, divided into ``blocks``, or raise DataError."""
+    def of(cls, bundles: Sequence[Bundle], blocks: Boxes, store: BlockStore) -> RayFile:
+        """Write bundles of rays through a volume that is divided into ``blocks``, or raise DataError."""
         arrays: dict[str, np.ndarray] = {}
         for k, bundle in enumerate(bundles):
-            eye, basis, lens = camera_arrays(frame, bundle.camera)
-            step = min(bundle.step, LONGEST)
-            arrays[f"camera{k}"] = np.concatenate([eye, basis.ravel(), lens, [step]])
+            arrays[f"camera{k}"] = np.concatenate([bundle.eye, bundle.basis.ravel(), bundle.lens, [bundle.step]])
             arrays[f"pixels{k}"] = bundle.pixels.astype(np.int32)
             arrays[f"offsets{k}"] = bundle.offsets
         name = f"rays-{digest(blocks, *arrays.values())[:16]}"
@@ -81,24 +75,13 @@ class RayFile:
                 np.savez(stream, allow_pickle=False, **arrays)
         return cls(str(path), name)
 
-    def bundles(self) -> list[KernelBundle]:
-        """Return the bundles for the kernels, read once per process; raise DataError if they are damaged or missing."""
+    def bundles(self) -> list[Bundle]:
+        """Return the bundles, read once per process; raise DataError if they are damaged or missing."""
         return _read(self.path)
 
 
-class KernelBundle(NamedTuple):
-    """A `Bundle` in the layout of the kernels."""
-
-    eye: np.ndarray
-    basis: np.ndarray
-    lens: np.ndarray
-    step: float
-    pixels: np.ndarray
-    offsets: np.ndarray
-
-
 @lru_cache(maxsize=2)
-def _read(path: str) -> list[KernelBundle]:
+def _read(path: str) -> list[Bundle]:
     try:
         with np.load(path) as arrays:
             out = []
@@ -107,7 +90,7 @@ def _read(path: str) -> list[KernelBundle]:
                 pixels = np.ascontiguousarray(arrays[f"pixels{k}"], np.int64)
                 basis = np.ascontiguousarray(numbers[3:12].reshape(3, 3))
                 out.append(
-                    KernelBundle(numbers[:3], basis, numbers[12:16], float(numbers[16]), pixels, arrays[f"offsets{k}"])
+                    Bundle(numbers[:3], basis, numbers[12:16], float(numbers[16]), pixels, arrays[f"offsets{k}"])
                 )
             return out
     except Exception as error:  # zipfile and numpy raise many types
@@ -174,7 +157,7 @@ def _piece_rays(
 
 def caster(
     box: VoxelBox, empty: np.ndarray, lo: np.ndarray, hi: np.ndarray, dims: tuple[int, int, int], light: Light | None
-) -> Callable[[KernelBundle, np.ndarray], np.ndarray]:
+) -> Callable[[Bundle, np.ndarray], np.ndarray]:
     """Return the function that casts rays through the voxels ``lo`` to ``hi`` (3,) of a volume, and those alone.
 
     Args:
@@ -203,7 +186,7 @@ def caster(
     lit = None if light is None else light._replace(origin=begin)
     bound = partial(kernel, box.voxels, box.optics, box.texels, empty, lit, faces, begin)
 
-    def cast(bundle: KernelBundle, which: np.ndarray) -> np.ndarray:
+    def cast(bundle: Bundle, which: np.ndarray) -> np.ndarray:
         seen = np.zeros((len(which), len(bundle.offsets), 4), np.float32)
         pixels = bundle.pixels if len(which) == len(bundle.pixels) else bundle.pixels[which]
         bound(*bundle[:4], pixels, bundle.offsets, seen)
@@ -212,7 +195,7 @@ def caster(
     return cast
 
 
-def meeting(cast: KernelBundle, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
+def meeting(cast: Bundle, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
     """Return the indices (n,) int64, ascending, of pixels whose rays may meet the box ``lo`` to ``hi`` (3,), voxels.
 
     These are the pixels in the bounding rectangle of the projected corners, or all if a corner is behind the eye.

@@ -11,7 +11,7 @@ import numpy as np
 
 from vvgt_cli.dvr.layers import Layer, grid_box
 from vvgt_cli.dvr.layout import Texels, Voxels
-from vvgt_cli.dvr.scene import KernelRule
+from vvgt_cli.dvr.scene import KernelRule, read_only
 from vvgt_cli.field.layered import OpenedFile, content_of, open_content
 from vvgt_cli.look.tables import Optics
 from vvgt_cli.volume import ReadOptions, Volume, triple
@@ -78,20 +78,12 @@ class VoxelBox:
         return None if self.grid is None else Texels(self.grid)
 
     def part(self, lo: np.ndarray, hi: np.ndarray) -> VoxelBox:
-        """Return a copy of the voxels ``lo`` to ``hi`` (3,) of the volume that lie in this box."""
+        """Return the voxels ``lo`` to ``hi`` (3,) of the volume that lie in this box."""
         a = np.maximum(lo - self.begin, 0)
         b = np.minimum(hi - self.begin, self.values.shape[::-1])
         index = tuple(slice(int(p), int(q)) for p, q in zip(a[::-1], b[::-1], strict=True))
         grid = None if self.grid is None else np.ascontiguousarray(self.grid[index])
-        return VoxelBox(_kept(self.values[index]), grid, self.optics, self.begin + a)
-
-
-def _kept(values: np.ndarray) -> np.ndarray:
-    """Return values C-contiguous and read-only, as kernels are compiled for."""
-    out = np.ascontiguousarray(values)
-    out = out.copy() if out.base is not None and out is values else out
-    out.flags.writeable = False
-    return out
+        return VoxelBox(read_only(self.values[index], self.values.dtype), grid, self.optics, self.begin + a)
 
 
 @dataclass(frozen=True)
@@ -109,25 +101,13 @@ class Scalars:
     optics: Optics = field(repr=False)
 
     @property
-    def all_places(self) -> tuple[VolumeOrigin, ...]:
-        """Origin of each volume."""
-        return (self.place,)
-
-    @property
     def voxel_bytes(self) -> int:
         """Bytes per voxel while a box is read."""
         return self.rule.dtype.itemsize + 8
 
     def box(self, lo: np.ndarray, hi: np.ndarray) -> VoxelBox:
         """Read the voxels ``lo`` to ``hi`` (3,), x first; raise DataError if the file or a chunk is damaged."""
-        stored = read_block(self.place.volume(), lo, hi)
-        if self.rule.half_width is None and stored.dtype == self.rule.dtype:
-            values = stored
-        else:
-            values = np.empty(stored.shape, self.rule.dtype)
-            for z, plane in enumerate(stored):  # by planes: the intermediate is float64
-                values[z] = self.rule.apply(plane)
-        values.flags.writeable = False
+        values = self.rule.laid_out(read_block(self.place.volume(), lo, hi))
         return VoxelBox(values, None, self.optics, lo.astype(np.int64))
 
 
@@ -151,11 +131,6 @@ class Layers:
     scale: float
     optics: Optics = field(repr=False)
     voxel_bytes = 60
-
-    @property
-    def all_places(self) -> tuple[VolumeOrigin, ...]:
-        """Origin of each volume."""
-        return tuple(place for places in self.places for place in places)
 
     def __getstate__(self) -> dict[str, object]:
         """Return the fields alone: other processes open the volumes themselves."""

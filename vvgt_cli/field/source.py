@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from vvgt_cli.dvr.layers import Layer, common_grid, grid_of
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError
 from vvgt_cli.field.digests import digest, volume_digest
-from vvgt_cli.field.layered import IN_MEMORY, Access, OpenedFile, content_of, is_plain, layers_of, told_apart
+from vvgt_cli.field.layered import Access, OpenedFile, content_of, layers_of, told_apart
 from vvgt_cli.jit.ahead import for_grid, for_light
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.histogram import UNIT_SHARE
@@ -299,8 +299,8 @@ class StyledVolume:
         return Scene.build(self.volume, self.tf, self.unit_distance, limits, lighting=self.lighting, layout=self.layout)
 
 
-def load(request: SourceRequest, access: Access = IN_MEMORY) -> StyledVolume:
-    """Read the function and the volume; ``access`` decides whether the volume is read whole or in blocks.
+def load(request: SourceRequest, access: Access | None = None) -> StyledVolume:
+    """Read the function and the volume; ``access`` decides whether the volume is read in blocks, by default whole.
 
     Raises:
         DataError: a file is not valid, or the function leaves the volume invisible.
@@ -309,56 +309,34 @@ def load(request: SourceRequest, access: Access = IN_MEMORY) -> StyledVolume:
     return load_all([request], access)[0]
 
 
-def load_all(requests: Sequence[SourceRequest], access: Access = IN_MEMORY) -> list[StyledVolume]:
+def load_all(requests: Sequence[SourceRequest], access: Access | None = None) -> list[StyledVolume]:
     """Read one volume and return it under each of several looks.
 
     Raises:
         DataError, UsageError: see `load`.
     """
-    from vvgt_cli.look import check_visible, from_histogram, read_transfer_function, resolve, unit_distance
+    from vvgt_cli.look import read_transfer_function
     from vvgt_cli.look.resolve import parse_tf_range
 
     functions = []  # which are small: report their errors before reading the volume
     for request in requests:
         tf = read_transfer_function(request.tf) if isinstance(request.tf, str) else request.tf
-        functions.append((request, tf, parse_tf_range(request.tf_range)))
+        functions.append((tf, parse_tf_range(request.tf_range)))
         if tf is None and request.tf_range != "data":
             raise UsageError("--tf-range: it places the nodes of a function; expected --tf as well")
-    content = access.open(requests[0].volume, requests[0].read)
-    reused = content is requests[0].volume and access is IN_MEMORY  # for several functions
-    volume, sources, stats = content.volumes[0], [], None
-    for request, tf, tf_range in functions:
-        if not is_plain(content, tf, request.labels, request.layers, access):
-            sources.append(_layered(request, content, tf, tf_range, access))
-            continue
-        unit_distance(request.unit_distance, volume)  # report its errors first
-        if stats is None:
-            stats = content.statistics if reused else access.statistics(volume)
-        whole = request.statistics[0] if request.statistics else stats
-        if tf:
-            shown = resolve(tf, whole, tf_range, volume.hounsfield)
-        else:
-            shown = from_histogram(whole, volume.hounsfield, volume.preset)
-        if tf is None and whole.lo == whole.hi:
-            warnings.warn(
-                f"{volume.name}: every voxel is {whole.lo:g}, so only the box is visible; check --dtype, --component "
-                "or --array, or pass --tf",
-                stacklevel=2,
-            )
-        if not request.statistics:  # a frame of a series may be dark
-            check_visible(shown, stats)
-        layer = Layer(volume, shown, *unit_distance(request.unit_distance, volume, tf or shown))
-        layout = content.layout if reused else None
-        lighting = request.light.lighting(shown.lighting, volume.space)
-        sources.append(StyledVolume((layer,), volume, stats, lighting, layout, tuple(request.statistics)))
+    own = access or Access()
+    content = own.open(requests[0].volume, requests[0].read)
+    sources = [_styled(one, content, *function, own) for one, function in zip(requests, functions, strict=True)]
+    if access is None and content is requests[0].volume:  # for several functions
+        sources = [source if source.gridded else replace(source, layout=content.layout) for source in sources]
     return sources
 
 
-def _layered(
+def _styled(
     request: SourceRequest, content: OpenedFile, tf: TransferFunction | None, tf_range: str | tuple[float, float],
     access: Access,
 ) -> StyledVolume:  # fmt: skip
-    """Return the optics grid that is the sum of a volume and its layers."""
+    """Return a volume under its look; with other layers, labels or colours, the optics grid that they add up to."""
     layers = layers_of(content, tf, request.labels, tf_range, request.unit_distance, request.statistics, access)
     for other in request.layers:
         try:
@@ -374,10 +352,16 @@ def _layered(
         used = set(palette()[: max(int(request.statistics[0].hi), 0)] if frames else ())
         layers = [*layers[:frames], *told_apart(layers[frames:], used)]
     lighting = request.light.lighting(layers[0].tf.lighting, content.volumes[0].space)
-    stats = access.statistics(layers[0].volume)
-    _check_seen(layers, access, len(request.statistics))
-    grid = common_grid(layers, content.stored)
-    return StyledVolume(tuple(layers), grid, stats, lighting, series=tuple(request.statistics))
+    stats, series = access.statistics(layers[0].volume), tuple(request.statistics)
+    _check_seen(layers, access, len(series))
+    source = StyledVolume(tuple(layers), common_grid(layers, content.stored), stats, lighting, series=series)
+    if tf is None and not source.gridded and source.overall.lo == source.overall.hi:
+        warnings.warn(
+            f"{source.volume.name}: every voxel is {source.overall.lo:g}, so only the box is visible; check --dtype, "
+            "--component or --array, or pass --tf",
+            stacklevel=3,
+        )
+    return source
 
 
 def _check_seen(layers: Sequence[Layer], access: Access, frame: int) -> None:

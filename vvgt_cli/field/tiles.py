@@ -1,10 +1,12 @@
 """A pyramid on disk, of which one tile at a time is in memory.
 
+The cells of each tile form a tree that ends in the tile's own cell; these roots are the base of a top tree.
 Scores are kept in a file a block, two numbers per cell, so that a threshold is found without the moments.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -17,7 +19,7 @@ from vvgt_cli.closed_form.lit import SEEN_LITTLE, Shading, base_rows
 from vvgt_cli.closed_form.moments import Cells, morton
 from vvgt_cli.closed_form.pyramid import Pyramid, Tile
 from vvgt_cli.closed_form.surface_offset import SURFACE, nowhere, smoothed
-from vvgt_cli.closed_form.tree import Leaves, Scores, leaves_of, split_score
+from vvgt_cli.closed_form.tree import Leaves, Scores, Tree, leaves_of, split_score, threshold_for, tree_over
 from vvgt_cli.closed_form.visibility import Visibility, march_views
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.dvr.render import BoxFrame
@@ -191,30 +193,75 @@ class TiledPyramid(Pyramid):
         """Levels above the cells of a tile; None where one tile is all there is, whose tree ends in one cell."""
         return None if len(self.places) == 1 else self.grid.bits
 
-    def roots(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Implement `Pyramid.roots`."""
-        places, _, (moments, largest, _) = self._saved
+    @cached_property
+    def top(self) -> Tree:
+        """The tree over the own cells of the tiles that some view sees."""
+        places, _, (own, seen, _) = self._saved
         alone = bool(places) and self._levels is None
         edge = self.tile(0).tree.edges[-1] if alone else self.grid.cell_edge * self.grid.tile_cells
-        return np.array([place[:3] for place in places], np.int32).reshape(-1, 3), edge, moments, largest
+
+        def fill(moments: np.ndarray, largest: np.ndarray) -> None:
+            moments[:], largest[:] = own, seen
+
+        return tree_over(np.array([place[:3] for place in places], np.int32).reshape(-1, 3), edge, fill)
+
+    @cached_property
+    def _top_scores(self) -> Scores:
+        return Scores.of(self.top, split_score(self.top))
+
+    def __len__(self) -> int:
+        """Return the number of tiles."""
+        return len(self._saved[0])
 
     def tile(self, row: int) -> Tile:
-        """Implement `Pyramid.tile`; raise DataError if its block is damaged."""
+        """Return a tile; raise DataError if its block is damaged."""
         return self._tile(self._saved[0][row])
 
     def _tile(self, place: Place) -> Tile:
         cells = read_cells(self.store, self.grid, place, self.shading is not None)
         return Tile.of(cells, self.seen, self.step, self._levels)
 
-    def scores_of(self, row: int) -> Scores:
-        """Implement `Pyramid.scores_of`; raise DataError if the file is damaged."""
+    def _scores(self, row: int) -> Scores:
+        """Return the scores of a tile's cells, at most those of the cells above; raise DataError for a damaged file."""
         size, base, offset = self._saved[1][row]
-        path = self.store.path(TREES, self._saved[0][row].block, SCORES)
+        path, top = self.store.path(TREES, self._saved[0][row].block, SCORES), self._top_scores
         try:
             above, capped = np.fromfile(path, np.float64, 2 * size, offset=offset).reshape(2, size)
         except (OSError, ValueError) as error:
             raise DataError(f"{path}: damaged ({error}); remove it and its .npz and run the command again") from error
+        above, capped = np.minimum(above, top.capped[row]), np.minimum(capped, top.capped[row])
+        above[-1] = top.above[row]
         return Scores(above, capped, np.arange(size) >= base)
+
+    def scores_over_tiles(self) -> Scores:
+        """Return the scores of the cells that hold several tiles."""
+        return Scores(*(column[len(self) :] for column in self._top_scores))
+
+    def scores(self) -> Iterator[Scores]:
+        """Yield the scores of each tile in turn, then those of `scores_over_tiles`."""
+        yield from map(self._scores, range(len(self)))
+        yield self.scores_over_tiles()
+
+    def threshold(self, budget: int) -> float:
+        """Return the threshold of scores for at most ``budget`` cells."""
+        return threshold_for(self.scores, budget)
+
+    def counts(self, threshold: float) -> np.ndarray:
+        """Return the number of leaves for a threshold in each tile, and last that over several tiles."""
+        return np.array([int(scores.leaves(threshold).sum()) for scores in self.scores()])
+
+    def cuts(self, begin: int, end: int, thresholds: np.ndarray, least: bool = True) -> Iterator[list[Leaves]]:
+        """Yield, for each of the tiles from ``begin`` to ``end``, the leaves for each of its ``thresholds`` (tiles, n).
+
+        Under light the means of `Shading.lit` follow their moments. With ``least`` there is always at least the tile's
+        own cell.
+        """
+        for row in range(begin, end):
+            tile, scores = self.tile(row), self._scores(row)
+            if least:
+                scores.above[-1] = np.inf
+            chosen = [np.flatnonzero(scores.leaves(threshold)) for threshold in thresholds[row]]
+            yield [self.shaded(leaves_of(tile.tree, nodes), tile) for nodes in chosen]
 
     def leaves_over_tiles(self, threshold: float) -> Leaves | None:
         """Return the leaves for a threshold that stand for several tiles each; None if there are none.

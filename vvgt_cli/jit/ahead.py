@@ -12,7 +12,7 @@ VOXEL_MOMENTS = "vvgt_cli.closed_form.voxelwise:voxel_moments"  # of cells wider
 MORTON, MIX = "vvgt_cli.closed_form.cell_kernels:morton_codes", "vvgt_cli.closed_form.sharpen:mix_neighbours"
 AXES_STEPS = "vvgt_cli.refine.steps:own_axes"
 REGRESS = tuple(f"vvgt_cli.refine.steps:{name}" for name in ("adam_sizes", "adam_directions", "regress"))
-PAIR_SUMS, STANDARD = "vvgt_cli.splat.backward:moments", "vvgt_cli.splat.backward:standard"
+PAIR_SUMS, EXACT_AXES = "vvgt_cli.splat.backward:moments", "vvgt_cli.splat.backward:exact_axes"
 VIEW_SLOPES, VIEW_COLORS = "vvgt_cli.splat.harmonics:view_slopes", "vvgt_cli.splat.harmonics:view_colors"
 FIELD_STEPS = "vvgt_cli.refine.steps:adam"  # harmonics take them even where all else steps along own axes
 
@@ -73,7 +73,7 @@ LIVE = ("vvgt_cli.closed_form.gaussian_samples:sample_points",)
 VOXELIZE = ("vvgt_cli.closed_form.values_back:deposit", "vvgt_cli.closed_form.values_back:sample")
 OPTIMIZE = (*REFINE, *DRAW, "vvgt_cli.closed_form.cell_kernels:principal_axes", *SHARED)
 EVALUATE = (*RAYCAST, *DRAW)
-INFER = (*DRAW, PAIR_SUMS, STANDARD, *BACK_PROJECT)
+INFER = (*DRAW, PAIR_SUMS, EXACT_AXES, *BACK_PROJECT)
 ALL = (
     *CONVERT,
     *GREATEST,
@@ -83,7 +83,7 @@ ALL = (
     *PATHS,
     *GRID.values(),
     "vvgt_cli.dvr.place:place",
-    STANDARD,
+    EXACT_AXES,
     VIEW_SLOPES,
     VIEW_COLORS,
     FIELD_STEPS,

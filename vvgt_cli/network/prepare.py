@@ -218,24 +218,6 @@ def damped(
 FIELDS = ((0, 3), (3, 6), (6, 9), (9, 10), (10, 13))  # d, e, w, logit, colour: columns of a step
 
 
-def own_axes_gradients(
-    quaternions: np.ndarray, axes: np.ndarray, scales: np.ndarray, gradients: Sequence[np.ndarray]
-) -> np.ndarray:
-    """Return (K, 13) gradients by a step in the own axes, from those by the fields of `Gaussians`, in order.
-
-    ``quaternions`` (K, 4) have norm 1 and rotations ``axes`` (K, 3, 3); ``scales`` (K, 3) are standard deviations.
-    """
-    means, log_scales, turns, logits, colors = gradients
-    along = np.einsum("kij,ki->kj", axes, means) * scales
-    w, x, y, z = quaternions.T
-    a, b, c, d = turns.T
-    # q times (0, e_i) / 2, dotted with the gradient by q
-    spin = np.stack(
-        [w * b - x * a + z * c - y * d, w * c - z * b - y * a + x * d, w * d + y * b - x * c - z * a], axis=1
-    )
-    return np.concatenate([along, log_scales, spin / 2, logits[:, None], colors], axis=1)
-
-
 def slope_rows(gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarray, rule: Rule = INRIA) -> np.ndarray:
     """Return (K, `SLOPES`) float32 of Gaussians with unit quaternions; L is half a view's sum of squared RGBA errors.
 
@@ -245,11 +227,10 @@ def slope_rows(gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarr
     - log of the blending weight per view (pixels), log of the error below it, over that of the scene;
     - log of the scene's RMS error; log of a pixel's width at the origin, less that of a standard deviation.
     """
-    from vvgt_cli.gaussians.frames import rotations
-    from vvgt_cli.splat import gather, project, render, render_backward
+    from vvgt_cli.splat import gather, project, render
+    from vvgt_cli.splat.render import moments, step_slopes
 
     g, count = gaussians, len(gaussians)
-    axes, scales = rotations(g.quaternions).astype(np.float32), np.exp(g.log_scales)
     total, squares = np.zeros((count, STEP), np.float32), np.zeros((count, STEP), np.float32)
     weights, error = np.zeros((count, 5)), 0.0
     pixel = float(np.median([np.linalg.norm(c.position) / c.fx for c in cameras]))
@@ -258,9 +239,8 @@ def slope_rows(gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarr
         projection = project(g, camera, rule)
         image = render(g, camera, projection=projection)
         rest = image - view
-        slope = render_backward(g, camera, projection, image, 2 * rest)
-        fields = slope.means, slope.log_scales, slope.quaternions, slope.opacity_logits, slope.colors
-        own = own_axes_gradients(g.quaternions, axes, scales, fields)
+        pairs = moments(projection, g.colors, image, 2 * rest)
+        own = step_slopes(g, camera, projection, pairs, g.colors).astype(np.float32)
         total += own
         squares += own * own
         size = np.sqrt((rest**2).mean(axis=2))  # (h, w) RMS over RGBA

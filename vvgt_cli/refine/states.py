@@ -47,11 +47,6 @@ KNOWN_HARMONICS_RATE = 0.3  # of the rate of harmonics, where the start has some
 DEFAULT = OptimizeOptions()
 
 
-def _last(arrays: tuple[np.ndarray, ...], index: int) -> np.ndarray | None:
-    """Return the harmonics, where there are any: the last of a state's arrays."""
-    return arrays[index] if len(arrays) > index else None
-
-
 def _has_harmonics(harmonics: np.ndarray | None) -> bool:
     """Return whether the highest degree of ``harmonics`` (K, M, 3), which has most of them, holds something."""
     if harmonics is None:
@@ -99,12 +94,14 @@ class OnHost(State):
     """A state whose steps the CPU takes.
 
     Attributes:
-        arrays: what is descended on, colours and harmonics last.
+        COLORS: number of the colours among the arrays; harmonics, if there are any, follow.
+        arrays: what is descended on.
         running: Adam's two moments of each array that it takes one by one.
         error: running RMS error of the pictures.
         taken: number of steps.
     """
 
+    COLORS: int
     arrays: tuple[np.ndarray, ...]
     running: list[np.ndarray]
 
@@ -139,9 +136,14 @@ class OnHost(State):
         self.running = [saved[f"running_{i}"] for i in range(len(self.running))]
         self.taken, self.error = int(saved["step"]), float(saved["error"])
 
-    @abstractmethod
+    @property
+    def harmonics(self) -> np.ndarray | None:
+        """Harmonics of the colours, where there are any."""
+        return self.arrays[self.COLORS + 1] if len(self.arrays) > self.COLORS + 1 else None
+
     def colors_from(self, camera: Camera) -> np.ndarray:
         """Return (K, 3) colours as the camera sees them, which may be negative."""
+        return seen_colors(self.arrays[0], self.arrays[self.COLORS], self.harmonics, camera.position)
 
     @abstractmethod
     def project(self, camera: Camera, rule: Rule = INRIA) -> Projection:
@@ -168,7 +170,7 @@ class OwnAxes(OnHost):
     OWN = np.array([0.75, 1.0, 1.0, 0.75, 0.75, 1.0])
     CLIPS = np.array([0.5, 1.0, 0.3])  # d, logit, E
     ERROR, LARGEST = 0.05, 1.5
-    BETAS = 0.6, 0.999
+    BETAS, COLORS = (0.6, 0.999), 3
 
     def __init__(
         self, gaussians: Gaussians, cameras: Sequence[Camera], options: OptimizeOptions = DEFAULT,
@@ -197,10 +199,6 @@ class OwnAxes(OnHost):
         self.fixed = np.empty(0, np.int64) if free is None else np.flatnonzero(~free)
         self.there = tuple(array[self.fixed] for array in self.arrays)
 
-    def colors_from(self, camera: Camera) -> np.ndarray:
-        """Return (K, 3) colours as the camera sees them, which may be negative."""
-        return seen_colors(self.arrays[0], self.arrays[3], _last(self.arrays, 4), camera.position)
-
     def project(self, camera: Camera, rule: Rule = INRIA) -> Projection:
         """Return the projection of the current Gaussians, by ``rule``."""
         means, factors, logits = self.arrays[:3]
@@ -211,7 +209,7 @@ class OwnAxes(OnHost):
     ) -> None:
         """Take one step, with harmonics where there are any."""
         means, factors, logits, colors = self.arrays[:4]
-        harmonics, seen = _last(self.arrays, 4), self.colors_from(camera)
+        harmonics, seen = self.harmonics, self.colors_from(camera)
         pairs = moments(projection, seen, image, grad)
         rows, by_harmonics = own_axes_backward(means, factors, seen, camera, projection, pairs, harmonics)
         rates, pace = self.rates(share, speed)
@@ -284,7 +282,7 @@ class Fields(OnHost):
     """Adam on the fields of `Gaussians` with the rates of 3DGS (Kerbl et al. 2023), nothing else of theirs."""
 
     RATES = (5e-4, 5e-3, 1e-3, 5e-2, 2.5e-3 * SH_C0, 2.5e-3 / 20)  # lengths: 1.6e-4 x an extent of 3.3
-    BETAS = 0.9, 0.999
+    BETAS, COLORS = (0.9, 0.999), 4
 
     def __init__(
         self, gaussians: Gaussians, cameras: Sequence[Camera], options: OptimizeOptions = DEFAULT,
@@ -294,10 +292,6 @@ class Fields(OnHost):
         super().__init__(options)
         self.arrays = tuple(array.copy() for array in gaussians.arrays().values())
         self.running = [np.zeros_like(array) for array in self.arrays for _ in range(2)]
-
-    def colors_from(self, camera: Camera) -> np.ndarray:
-        """Return (K, 3) colours as the camera sees them, which may be negative."""
-        return seen_colors(self.arrays[0], self.arrays[4], _last(self.arrays, 5), camera.position)
 
     def project(self, camera: Camera, rule: Rule = INRIA) -> Projection:
         """Return the projection of the current Gaussians, by ``rule``."""

@@ -41,16 +41,13 @@ from vvgt_cli.splat.buffer import (
     prefetch,
     tile_jit,
 )
-from vvgt_cli.splat.kernel import rotate, rotation_column, to_camera, unit_quaternion
 from vvgt_cli.splat.lanes import (
     CONIC,
     LANES,
     SLOPED,
     TOTALS,
-    centre_slope,
     load_place,
     pose_of,
-    screen_slope,
     slope_lanes,
 )
 
@@ -201,40 +198,6 @@ def total_of(pairs: np.ndarray, begin: int, end: int) -> tuple[float, ...]:
 
 
 @_exact
-def _screen(
-    flat: np.ndarray, k: int, total: tuple[float, ...], dilation: float, compensate: float
-) -> tuple[float, ...]:
-    """Return `screen_slope` of Gaussian k."""
-    return screen_slope(
-        np.float64(flat[k, 2]), np.float64(flat[k, 3]), np.float64(flat[k, 4]), total[0], total[1], total[2], total[3],
-        total[4], total[5], dilation, compensate,
-    )  # fmt: skip
-
-
-@parallel_kernel()
-def screen(thread: ThreadSlice, first: np.ndarray, pairs: np.ndarray, flat: np.ndarray, out: np.ndarray) -> None:
-    """Write the length of the gradient by each projected centre (px) into ``out`` (K,) float64; 0 where unseen."""
-    for k in iterations(thread, flat.shape[0]):
-        out[k] = 0.0
-        if first[k + 1] > first[k]:
-            total = total_of(pairs, first[k], first[k + 1])
-            du, dv, _, _, _ = _screen(flat, k, total, 0.0, 0.0)
-            out[k] = np.sqrt(du * du + dv * dv)
-
-
-@_exact
-def _colors_and_logit(
-    k: int, flat: np.ndarray, colors: np.ndarray, total: tuple[float, ...], out_logits: np.ndarray,
-    out_colors: np.ndarray,
-) -> None:  # fmt: skip
-    """Write row k of ``out_logits`` (K,) and ``out_colors`` (K, 3), float32."""
-    out_logits[k] = total[0] * (1.0 - flat[k, 6])
-    out_colors[k, 0] = total[6] if colors[k, 0] >= 0.0 else 0.0
-    out_colors[k, 1] = total[7] if colors[k, 1] >= 0.0 else 0.0
-    out_colors[k, 2] = total[8] if colors[k, 2] >= 0.0 else 0.0
-
-
-@_exact
 def _load_slope(
     buf: np.ndarray, i: int, k: int, flat: np.ndarray, means: np.ndarray, factors: np.ndarray, total: tuple[float, ...]
 ) -> None:
@@ -246,16 +209,15 @@ def _load_slope(
         buf[U((TOTALS + f) * LANES + i)] = total[f]
 
 
-@parallel_kernel("i8:1 f4:2 i4:2 f4:2 f4:2 f4:3 f4:2 f8:2 f8:1 f8:1 f8:1 f4:2")
-def own_axes(
+def _own_axes(
     thread: ThreadSlice,
     first: np.ndarray, pairs: np.ndarray, extent: np.ndarray, flat: np.ndarray, means: np.ndarray, factors: np.ndarray,
     colors: np.ndarray, rot: np.ndarray, trans: np.ndarray, lens: np.ndarray, rule: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
     """Write gradients for steps along each Gaussian's own axes: mu += M d, M <- M (I + E), E symmetric.
 
-    ``out`` (13, K) float32, a row a field: d (3), then E: xx, yy, zz, xy, xz, yz (an entry off the diagonal stands for
-    both), opacity logit, colour (3). Every row is written.
+    ``out`` (13, K), a row a field: d (3), then E: xx, yy, zz, xy, xz, yz (an entry off the diagonal stands for both),
+    opacity logit, colour (3). Every row is written.
     """
     count, pose, way = means.shape[0], pose_of(rot, trans), (lens[0], lens[1])
     for chunk in iterations(thread, (count + LANES - 1) // LANES):
@@ -279,78 +241,6 @@ def own_axes(
                 out[f, k] = buf[U(f * LANES + k - begin)] if seen[k - begin] else 0.0
 
 
-@_exact
-def _column(
-    turn: tuple[float, ...], i: int, log_scale: float, rot: np.ndarray, slopes: tuple[float, ...]
-) -> tuple[float, tuple[float, float, float], tuple[float, float, float, float]]:
-    """Return axis i's gradient of its log-scale, of its column of the rotation (3), and its part of dL/dJ (4)."""
-    jx, jy, jxz, jyz, h00, h01, h11 = slopes
-    w, a, b, c = turn
-    v0, v1, v2 = rotate(rot, *rotation_column(w, a, b, c, i))
-    s = np.exp(np.float64(log_scale))
-    n0, n1 = (jx * v0 + jxz * v2) * s, (jy * v1 + jyz * v2) * s
-    e0, e1 = 2.0 * (h00 * n0 + h01 * n1), 2.0 * (h01 * n0 + h11 * n1)
-    scale = e0 * n0 + e1 * n1
-    e0, e1 = e0 * s, e1 * s
-    x, y, z = jx * e0, jy * e1, jxz * e0 + jyz * e1  # dL/d(column) in the camera's axes
-    column = (
-        rot[0, 0] * x + rot[1, 0] * y + rot[2, 0] * z,
-        rot[0, 1] * x + rot[1, 1] * y + rot[2, 1] * z,
-        rot[0, 2] * x + rot[1, 2] * y + rot[2, 2] * z,
-    )
-    return scale, column, (e0 * v0, e0 * v2, e1 * v1, e1 * v2)
-
-
-@_exact
-def _quaternion(
-    w: float, a: float, b: float, c: float, n: float, c0: tuple[float, float, float], c1: tuple[float, float, float],
-    c2: tuple[float, float, float], out: np.ndarray,
-) -> None:  # fmt: skip
-    """Return the gradient by a quaternion of any norm, from those of its rotation's columns."""
-    gw = 2 * (a * (c1[2] - c2[1]) + b * (c2[0] - c0[2]) + c * (c0[1] - c1[0]))
-    ga = 2 * (w * (c1[2] - c2[1]) + b * (c1[0] + c0[1]) + c * (c2[0] + c0[2]) - 2 * a * (c1[1] + c2[2]))
-    gb = 2 * (w * (c2[0] - c0[2]) + a * (c1[0] + c0[1]) + c * (c2[1] + c1[2]) - 2 * b * (c0[0] + c2[2]))
-    gc = 2 * (w * (c0[1] - c1[0]) + a * (c2[0] + c0[2]) + b * (c2[1] + c1[2]) - 2 * c * (c0[0] + c1[1]))
-    along = gw * w + ga * a + gb * b + gc * c
-    out[0], out[1], out[2], out[3] = (
-        (gw - along * w) * n,
-        (ga - along * a) * n,
-        (gb - along * b) * n,
-        (gc - along * c) * n,
-    )
-
-
-@parallel_kernel("i8:1 f4:2 i4:2 f4:2 f4:2 f4:2 f4:2 f4:2 f8:2 f8:1 f8:1 f8:1 f4:2 f4:2 f4:2 f4:1 f4:2")
-def standard(
-    thread: ThreadSlice, first: np.ndarray, pairs: np.ndarray, extent: np.ndarray, flat: np.ndarray, means: np.ndarray,
-    log_scales: np.ndarray, quats: np.ndarray, colors: np.ndarray, rot: np.ndarray, trans: np.ndarray, lens: np.ndarray,
-    rule: np.ndarray, out_means: np.ndarray, out_scales: np.ndarray, out_quats: np.ndarray, out_logits: np.ndarray,
-    out_colors: np.ndarray,
-) -> None:  # fmt: skip
-    """Write gradients with respect to the fields of `Gaussians`, float32 arrays of their shapes."""
-    fx, fy = lens[0], lens[1]
-    for k in iterations(thread, means.shape[0]):
-        out_means[k] = 0.0
-        out_scales[k] = 0.0
-        out_quats[k] = 0.0
-        out_logits[k] = 0.0
-        out_colors[k] = 0.0
-        if extent[k, 2] <= extent[k, 0]:
-            continue
-        total = total_of(pairs, first[k], first[k + 1])
-        _colors_and_logit(k, flat, colors, total, out_logits, out_colors)
-        x, y, z = to_camera(means, k, rot, trans)
-        du, dv, h00, h01, h11 = _screen(flat, k, total, rule[0], rule[1])
-        jx, jy, jxz, jyz = fx / z, fy / z, -fx * x / (z * z), -fy * y / (z * z)
-        w, a, b, c, n = unit_quaternion(quats, k)
-        turn = w, a, b, c
-        screen_slopes = jx, jy, jxz, jyz, h00, h01, h11
-        s0, c0, d0 = _column(turn, 0, log_scales[k, 0], rot, screen_slopes)
-        s1, c1, d1 = _column(turn, 1, log_scales[k, 1], rot, screen_slopes)
-        s2, c2, d2 = _column(turn, 2, log_scales[k, 2], rot, screen_slopes)
-        out_scales[k, 0], out_scales[k, 1], out_scales[k, 2] = s0, s1, s2
-        d00, d02, d11, d12 = d0[0] + d1[0] + d2[0], d0[1] + d1[1] + d2[1], d0[2] + d1[2] + d2[2], d0[3] + d1[3] + d2[3]
-        dx, dy, dz = centre_slope(x, y, z, fx, fy, du, dv, d00, d02, d11, d12)
-        for j in range(3):
-            out_means[k, j] = rot[0, j] * dx + rot[1, j] * dy + rot[2, j] * dz
-        _quaternion(w, a, b, c, n, c0, c1, c2, out_quats[k])
+AXES = "i8:1 f4:2 i4:2 f4:2 f4:2 {0}:3 f4:2 f8:2 f8:1 f8:1 f8:1 {0}:2"
+own_axes = parallel_kernel(AXES.format("f4"), name="own_axes")(_own_axes)
+exact_axes = parallel_kernel(AXES.format("f8"), name="exact_axes")(_own_axes)  # of which gradients of fields are made

@@ -10,6 +10,7 @@ centre x, y (px), conic a, b, c (px^-2), opacity as drawn and as given; ``depth`
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -36,17 +37,6 @@ AHEAD = 16  # Gaussians whose boxes are asked for before they are read: in the o
 
 
 @_jit
-def to_camera(means: np.ndarray, k: int, rot: np.ndarray, trans: np.ndarray) -> tuple[float, float, float]:
-    """Return Gaussian k's centre in camera coordinates, float64."""
-    m0, m1, m2 = np.float64(means[k, 0]), np.float64(means[k, 1]), np.float64(means[k, 2])
-    return (
-        rot[0, 0] * m0 + rot[0, 1] * m1 + rot[0, 2] * m2 + trans[0],
-        rot[1, 0] * m0 + rot[1, 1] * m1 + rot[1, 2] * m2 + trans[1],
-        rot[2, 0] * m0 + rot[2, 1] * m1 + rot[2, 2] * m2 + trans[2],
-    )
-
-
-@_jit
 def unit_quaternion(quats: np.ndarray, k: int) -> tuple[float, ...]:
     """Return row k of ``quats`` (K, 4) divided by its norm, and 1 / norm, float64."""
     w, a, b, c = np.float64(quats[k, 0]), np.float64(quats[k, 1]), np.float64(quats[k, 2]), np.float64(quats[k, 3])
@@ -65,75 +55,48 @@ def rotation_column(w: float, a: float, b: float, c: float, axis: int) -> tuple[
 
 
 @_jit
-def rotate(rot: np.ndarray, r0: float, r1: float, r2: float) -> tuple[float, float, float]:
-    """Multiply ``rot`` (3, 3) by a vector."""
-    return (
-        rot[0, 0] * r0 + rot[0, 1] * r1 + rot[0, 2] * r2,
-        rot[1, 0] * r0 + rot[1, 1] * r1 + rot[1, 2] * r2,
-        rot[2, 0] * r0 + rot[2, 1] * r1 + rot[2, 2] * r2,
-    )
-
-
-@_jit
-def _finish(
-    buf: np.ndarray, begin: int, count: int, pose: tuple[float, ...], lens: np.ndarray, rule: np.ndarray,
-    flat: np.ndarray, depth: np.ndarray, extent: np.ndarray,
-) -> None:  # fmt: skip
-    """Project and store ``count`` Gaussians from ``begin`` on, once they are in their lanes."""
-    fx, fy, cx, cy, width, height = lens
-    dilation, compensate, min_alpha, farthest, min_variance = rule
-    way = dilation, compensate, min_alpha, farthest, min_variance
-    project_lanes(buf, pose, (fx, fy, cx, cy), way)
-    boxes(buf, farthest, width, height)
-    store_projected(buf, begin, count, flat, depth, extent)
-
-
-@_jit
 def _opacity(logits: np.ndarray, k: int) -> float:
     """Return the sigmoid of ``logits`` (K,) of Gaussian k, float64."""
     opacity: float = 1.0 / (1.0 + math.exp(-np.float64(logits[k])))
     return opacity
 
 
-@parallel_kernel("f4:2 f4:2 f4:2 f4:1 f8:2 f8:1 f8:1 f8:1 f4:2 f4:1 i4:2")
-def project(
-    thread: ThreadSlice, means: np.ndarray, log_scales: np.ndarray, quats: np.ndarray, logits: np.ndarray,
-    rot: np.ndarray, trans: np.ndarray, lens: np.ndarray, rule: np.ndarray, flat: np.ndarray,
+def _project(
+    thread: ThreadSlice, means: np.ndarray, factors: np.ndarray | None, log_scales: Any, quats: Any,
+    logits: np.ndarray, rot: np.ndarray, trans: np.ndarray, lens: np.ndarray, rule: np.ndarray, flat: np.ndarray,
     depth: np.ndarray, extent: np.ndarray,
 ) -> None:  # fmt: skip
-    """Project every Gaussian by EWA into ``flat``, ``depth`` and ``extent``: every row is written."""
+    """Project every Gaussian by EWA into ``flat``, ``depth`` and ``extent``: every row is written.
+
+    Covariances are ``M M^T`` with ``factors`` (K, 3, 3) M; where these are None, of ``log_scales`` and ``quats``.
+    """
     total, pose = means.shape[0], pose_of(rot, trans)
+    fx, fy, cx, cy, width, height = lens
+    dilation, compensate, min_alpha, farthest, min_variance = rule
+    way = dilation, compensate, min_alpha, farthest, min_variance
     for chunk in iterations(thread, (total + LANES - 1) // LANES):
         begin = chunk * LANES
         count = min(LANES, total - begin)
         buf = np.zeros(PROJECTED * LANES)
         for i in range(count):
             k, j = begin + i, U(i)
-            buf[j], buf[j + U(LANES)], buf[j + U(2 * LANES)] = means[k, 0], means[k, 1], means[k, 2]
-            w, a, b, c, _ = unit_quaternion(quats, k)
-            put_column(buf, j, 0, rotation_column(w, a, b, c, 0), math.exp(np.float64(log_scales[k, 0])))
-            put_column(buf, j, 1, rotation_column(w, a, b, c, 1), math.exp(np.float64(log_scales[k, 1])))
-            put_column(buf, j, 2, rotation_column(w, a, b, c, 2), math.exp(np.float64(log_scales[k, 2])))
+            if quats is not None:  # numba leaves out what is of None, not what is of the others
+                buf[j], buf[j + U(LANES)], buf[j + U(2 * LANES)] = means[k, 0], means[k, 1], means[k, 2]
+                w, a, b, c, _ = unit_quaternion(quats, k)
+                put_column(buf, j, 0, rotation_column(w, a, b, c, 0), math.exp(np.float64(log_scales[k, 0])))
+                put_column(buf, j, 1, rotation_column(w, a, b, c, 1), math.exp(np.float64(log_scales[k, 1])))
+                put_column(buf, j, 2, rotation_column(w, a, b, c, 2), math.exp(np.float64(log_scales[k, 2])))
+            if factors is not None:
+                load_place(buf, j, k, means, factors)
             buf[j + OPACITY] = _opacity(logits, k)
-        _finish(buf, begin, count, pose, lens, rule, flat, depth, extent)
+        project_lanes(buf, pose, (fx, fy, cx, cy), way)
+        boxes(buf, farthest, width, height)
+        store_projected(buf, begin, count, flat, depth, extent)
 
 
-@parallel_kernel("f4:2 f4:3 f4:1 f8:2 f8:1 f8:1 f8:1 f4:2 f4:1 i4:2")
-def project_factors(
-    thread: ThreadSlice,
-    means: np.ndarray, factors: np.ndarray, logits: np.ndarray, rot: np.ndarray, trans: np.ndarray, lens: np.ndarray,
-    rule: np.ndarray, flat: np.ndarray, depth: np.ndarray, extent: np.ndarray,
-) -> None:  # fmt: skip
-    """Apply `project` to covariances ``M M^T`` given by ``factors`` (K, 3, 3) M."""
-    total, pose = means.shape[0], pose_of(rot, trans)
-    for chunk in iterations(thread, (total + LANES - 1) // LANES):
-        begin = chunk * LANES
-        count = min(LANES, total - begin)
-        buf = np.zeros(PROJECTED * LANES)
-        for i in range(count):
-            load_place(buf, U(i), begin + i, means, factors)
-            buf[U(i) + OPACITY] = _opacity(logits, begin + i)
-        _finish(buf, begin, count, pose, lens, rule, flat, depth, extent)
+_VIEW = "f4:1 f8:2 f8:1 f8:1 f8:1 f4:2 f4:1 i4:2"
+project = parallel_kernel(f"f4:2 none f4:2 f4:2 {_VIEW}", name="project")(_project)
+project_factors = parallel_kernel(f"f4:2 f4:3 none none {_VIEW}", name="project_factors")(_project)
 
 
 @_jit

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from vvgt_cli.cameras import Blocks, Camera
 from vvgt_cli.gaussians import INRIA, TILE, Gaussians, Rule, rule_of
+from vvgt_cli.gaussians.frames import axes_of, rotations
+
+LARGEST_LOG_SCALE = 200.0  # of either sign, in gradients
 
 
 @dataclass(frozen=True)
@@ -40,40 +44,32 @@ def project(gaussians: Gaussians, camera: Camera, rule: str | Rule = INRIA, *, b
 
     ``rule.at(w / W)`` gives, at a camera's size w, what viewers show at size W, at fewer points.
     """
-    from vvgt_cli.splat import kernel
-
     g = gaussians
     distance = np.linalg.norm(g.means - camera.position, axis=1).astype(np.float32) if by_distance else None
-    columns = g.means, g.log_scales, g.quaternions, g.opacity_logits
-    return _projected(kernel.project, columns, camera, rule, distance)
+    return _projected((g.means, None, g.log_scales, g.quaternions, g.opacity_logits), camera, rule, distance)
 
 
 def project_factors(
     means: np.ndarray, factors: np.ndarray, logits: np.ndarray, camera: Camera, rule: str | Rule = INRIA
 ) -> Projection:
     """Apply `project` for covariances ``M M^T``: means (K, 3), factors (K, 3, 3) M, logits (K,), all float32."""
-    from vvgt_cli.splat import kernel
-
-    return _projected(kernel.project_factors, (means, factors, logits), camera, rule)
+    return _projected((means, factors, None, None, logits), camera, rule)
 
 
 def _projected(
-    kernel_project: Callable[..., None],
-    arrays: tuple[np.ndarray, ...],
-    camera: Camera,
-    rule: str | Rule,
-    distance: np.ndarray | None = None,
+    columns: tuple[Any, ...], camera: Camera, rule: str | Rule, distance: np.ndarray | None = None
 ) -> Projection:
-    """Run one of the projecting kernels, sort by depth or by ``distance`` (K,) float32, file into tiles."""
+    """Project means, factors or log-scales and quaternions, logits; sort by depth or by ``distance`` (K,) float32."""
     import numba
 
     from vvgt_cli.splat import kernel
 
-    rule, count = rule_of(rule), len(arrays[0])
+    rule, count = rule_of(rule), len(columns[-1])
     flat = np.empty((count, 7), np.float32)
     depth = np.empty(count, np.float32)
     extent = np.empty((count, 4), np.int32)
-    kernel_project(*arrays, *pose(camera), rule.projecting(), flat, depth, extent)
+    run: Any = kernel.project if columns[1] is None else kernel.project_factors
+    run(*columns, *pose(camera), rule.projecting(), flat, depth, extent)
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
     order = depth_order(depth if distance is None else distance)
     start, members, slots, first = kernel.tile_lists(order, extent, tiles_x, tiles_y, numba.get_num_threads())
@@ -196,33 +192,58 @@ def render_backward(
     return fields_backward(gaussians, camera, projection, moments(projection, seen, image, grad), seen)
 
 
+def step_slopes(
+    gaussians: Gaussians, camera: Camera, projection: Projection, pairs: np.ndarray, seen: np.ndarray
+) -> np.ndarray:
+    """Return (K, 13) float64 gradients by a step in each Gaussian's own axes, which means the same at any size.
+
+    The step is ``mu + R S d``, ``log s + e``, ``q (1, w / 2)`` for unit q, then opacity logit and colour; arguments as
+    of `fields_backward`. Where a covariance ``M M^T`` turns by w, so it does by ``M (I + E)`` with E symmetric.
+    """
+    from vvgt_cli.splat import backward
+
+    g, p, rows = gaussians, projection, np.empty((13, len(gaussians)))
+    factors = np.ascontiguousarray(axes_of(g))
+    backward.exact_axes(
+        p.first, pairs, p.extent, p.flat, g.means, factors, seen, *pose(camera), p.rule.projecting(), rows
+    )
+    a, b, c = _scales(g).T
+    turns = [rows[8] * (b / c - c / b), rows[7] * (c / a - a / c), rows[6] * (a / b - b / a)]
+    rows[6:9] = 0.5 * np.array(turns)
+    return rows.T
+
+
 def fields_backward(
     gaussians: Gaussians, camera: Camera, projection: Projection, pairs: np.ndarray, seen: np.ndarray
 ) -> Gradients:
     """Return `render_backward` from ``pairs``, its `moments`, and the `seen_colors` (K, 3) behind them."""
-    from vvgt_cli.splat import backward
-
-    g, p = gaussians, projection
-    shapes = (g.means, g.log_scales, g.quaternions, g.opacity_logits, g.colors)
-    out = Gradients(*(np.empty_like(array) for array in shapes))
-    backward.standard(
-        p.first, pairs, p.extent, p.flat, g.means, g.log_scales, g.quaternions, seen, *pose(camera),
-        p.rule.projecting(),
-        out.means, out.log_scales, out.quaternions, out.opacity_logits, out.colors,
-    )  # fmt: skip
+    g, slopes = gaussians, step_slopes(gaussians, camera, projection, pairs, seen)
+    means = np.einsum("kij,kj->ki", rotations(g.quaternions), slopes[:, :3] / _scales(g))
+    (w, x, y, z), (a, b, c) = g.quaternions.T.astype(np.float64), slopes[:, 6:9].T
+    product = [-x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a]
+    turns = np.transpose(product) * (2 / (w * w + x * x + y * y + z * z))[:, None]
+    parts = means, slopes[:, 3:6], turns, slopes[:, 9], slopes[:, 10:]
+    out = Gradients(*(np.ascontiguousarray(part, np.float32) for part in parts))
     if g.harmonics is None:
         return out
     by_harmonics, by_means = seen_slopes(g.means, g.harmonics, camera.position, out.colors)
     return replace(out, means=out.means + by_means, harmonics=by_harmonics)
 
 
+def _scales(gaussians: Gaussians) -> np.ndarray:
+    """Return standard deviations (K, 3) float64, none so small or large that dividing by it fails."""
+    result: np.ndarray = np.exp(np.clip(gaussians.log_scales.astype(np.float64), -LARGEST_LOG_SCALE, LARGEST_LOG_SCALE))
+    return result
+
+
 def screen_slopes(projection: Projection, pairs: np.ndarray) -> np.ndarray:
     """Return the length (K,) float64 of the gradient by the projected centre in pixels, from `moments`."""
-    from vvgt_cli.splat import backward
+    from vvgt_cli.splat import tiles
 
-    out = np.zeros(len(projection.flat))
-    backward.screen(projection.first, pairs, projection.flat, out)
-    return out
+    p, sums = projection, np.zeros((len(projection.flat), 5))
+    tiles.reduce_pairs(p.first, np.ascontiguousarray(pairs[:, :5]), sums)
+    a, b, c = p.flat[:, 2:5].T.astype(np.float64)
+    return np.hypot(a * sums[:, 1] + b * sums[:, 2], b * sums[:, 1] + c * sums[:, 2])
 
 
 def moments(projection: Projection, colors: np.ndarray, image: np.ndarray, grad: np.ndarray) -> np.ndarray:

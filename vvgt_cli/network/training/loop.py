@@ -153,8 +153,7 @@ class _Run:
         tally = np.zeros(3)
         for index in range(here.rank, config.batch, here.size):
             rng = np.random.default_rng([config.seed, state.step, index])
-            one = accumulate_gradients(self.network, self.feeder, rng, here.device, self.lpips)
-            tally += [one.loss, one.gain, one.bad]
+            tally += accumulate_gradients(self.network, self.feeder, rng, here.device, self.lpips)
         here.add_gradients(self.network)
         loss, gain, bad, stop = here.total([*tally, bool(ended)])
         norm = float(torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.clip))

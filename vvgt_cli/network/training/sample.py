@@ -6,7 +6,6 @@ import importlib.util
 import math
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,15 +25,6 @@ from vvgt_cli.network.training.config import LossConfig, TrainConfig
 from vvgt_cli.network.training.lpips import Lpips
 from vvgt_cli.network.training.scenes import TrainingScene, as_float
 from vvgt_cli.splat import project, render, render_backward
-
-
-@dataclass
-class SceneTally:
-    """Contribution of a scene to a step's record; a scene that fails counts as ``bad`` and adds nothing else."""
-
-    loss: float = 0.0
-    gain: float = 0.0
-    bad: int = 0
 
 
 def run_network(network: Vvgt, inputs: dict[str, Tensor], device: torch.device) -> Tensor:
@@ -85,15 +75,18 @@ class Feeder:
 
 def accumulate_gradients(
     network: Vvgt, feeder: Feeder, rng: np.random.Generator, device: torch.device, lpips: Lpips | None = None
-) -> SceneTally:
-    """Add the gradients of a random scene's loss in a random round: mean over views, over the batch."""
+) -> tuple[float, float, int]:
+    """Add the gradients of a random scene's loss in a random round: mean over views, over the batch.
+
+    Return loss, gain in dB, and 0; of a scene that fails 0, 0 and 1.
+    """
     config = feeder.config
     index, views, number = (int(rng.integers(n)) for n in (len(feeder.scenes), config.view_sets, config.network.rounds))
     scene, (prepared, inputs) = feeder.scenes[index], feeder.give(index, views, number)
     chosen = [int(i) for i in rng.permutation(len(scene.targets))[: config.views]]
     rows = run_network(network, inputs, device)
     if not torch.isfinite(rows).all():
-        return SceneTally(bad=1)
+        return 0.0, 0.0, 1
     before = prepared.restore(prepared.rows)
     loss, gain = rows.new_zeros(()), 0.0
     for i in chosen:
@@ -103,9 +96,9 @@ def accumulate_gradients(
         loss = loss + view_loss(picture, target, start, config.loss, lpips) / len(chosen)
         gain += float(decibels(picture.detach(), target, start)) / len(chosen)
     if not torch.isfinite(loss):
-        return SceneTally(bad=1)
+        return 0.0, 0.0, 1
     (loss / config.batch).backward()
-    return SceneTally(float(loss.detach()), gain)
+    return float(loss.detach()), gain, 0
 
 
 @torch.no_grad()
