@@ -4,29 +4,32 @@ python benchmarks/viewers.py VOLUME [--tf TF] [--viewer NAME]... [--format .spz]
 
 Needs Chromium, node and npm, as `make viewers` does. FOLDER keeps the files, and sheet.png: every picture, a quarter as
 wide, in the order of the rows, which are printed (viewer, format, unlit or lit, dB of its picture against our drawing
-by its rule, side of the highlights). Then the table: with --page, in place of the one there.
+by its rule, side of the highlights). Then the table: with --page, in place of the one there. A picture that FOLDER has
+of the same bytes and version is not taken again: a command that was stopped goes on.
 """
 
 from __future__ import annotations
 
 import json
 import re
+import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import date
+from hashlib import sha256
 from pathlib import Path
 
 import click
 import numpy as np
 
-from vvgt_cli.cameras import default_views
+from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.commands.main import run
 from vvgt_cli.conversion.gaussian_files import layout_of
 from vvgt_cli.gaussians import Gaussians, in_unit_frame, read_ply
 from vvgt_cli.gaussians.formats import SUFFIXES, encoded, format_of
 from vvgt_cli.gaussians.frames import transform, up_matrix, upright_matrix
-from vvgt_cli.images import write_png
+from vvgt_cli.images import read_png, write_png
 from vvgt_cli.images.metrics import psnr
 from vvgt_cli.splat import render
 
@@ -74,6 +77,21 @@ VIEWERS = {
 NOT_RUN = "RealityKit, Scaniverse, Unity, Unreal; Omniverse and Houdini, for `.usdc` and `.usdz`"
 
 
+def version(viewer: str) -> str:
+    """Return the version of a viewer's program."""
+    package = packages() / "node_modules" / VIEWERS[viewer].package / "package.json"
+    return str(json.loads(package.read_text())["version"])
+
+
+def picture(viewer: str, file: Path, seen: Camera) -> np.ndarray:
+    """Return what a viewer draws of a file, (SIZE, SIZE, 3), kept beside the file as a `.png`."""
+    digest = sha256(f"{version(viewer)} {SIZE} {seen.rotation.tolist()}".encode() + file.read_bytes()).hexdigest()
+    kept = file.with_name(f"{viewer}-{file.name}-{digest[:12]}.png")
+    if not kept.exists():
+        write_png(kept, shoot(viewer, file, [seen], SIZE, file.parent, VIEWERS[viewer].options)[0])
+    return read_png(kept)[..., :3]
+
+
 Row = tuple[float, str] | None  # dB of a viewer's picture against our drawing, side of highlights; None: it fails
 
 
@@ -108,8 +126,8 @@ def rows(
             if ending in how.refused:
                 continue
             try:
-                shots += shoot(viewer, file, [seen], SIZE, path.parent, how.options)
-            except AssertionError as error:
+                shots.append(picture(viewer, file, seen))
+            except (AssertionError, subprocess.TimeoutExpired) as error:
                 click.echo(f"{viewer} {ending}: {str(error).strip()[-300:]}", err=True)
                 yield viewer, ending, None
                 continue
@@ -120,13 +138,12 @@ def table(found: dict[tuple[str, str], list[Row]], formats: tuple[str, ...], wha
     """Markdown: a line an engine, with dB unlit, dB lit and the side of highlights by format."""
     lines = [f"| {what} | `{'` | `'.join(formats)}` |", "| --- " * (len(formats) + 1) + "|"]
     for viewer in dict.fromkeys(name for name, _ in found):
-        version = json.loads((packages() / "node_modules" / VIEWERS[viewer].package / "package.json").read_text())
         cells = []
         for ending in formats:
             pair = found.get((viewer, ending), [])
             said = [f"{row[0]:.1f} {row[1]}".strip() if row else "fails" for row in pair]
             cells.append(", ".join(said) or "not read")
-        lines.append(f"| {VIEWERS[viewer].name} {version['version']} | {' | '.join(cells)} |")
+        lines.append(f"| {VIEWERS[viewer].name} {version(viewer)} | {' | '.join(cells)} |")
     return "\n".join([*lines, f"| {NOT_RUN} | {' | '.join(['do not run here'] * len(formats))} |"])
 
 
@@ -161,7 +178,8 @@ def main(
             re.sub(r"\| dB unlit, dB lit.*?\n(?!\|)", lambda _: f"{text}\n", page.read_text(), flags=re.DOTALL)
         )
     small = [shot[::4, ::4] for shot in shots] + [np.zeros_like(shots[0][::4, ::4])] * (-len(shots) % WIDE)
-    write_png(pictures / "sheet.png", np.vstack([np.hstack(small[k : k + WIDE]) for k in range(0, len(small), WIDE)]))
+    sheet = np.vstack([np.hstack(small[k : k + WIDE]) for k in range(0, len(small), WIDE)])
+    write_png(pictures / "sheet.png", sheet, overwrite=True)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from pathlib import Path
 import hypothesis
 import pytest
 
-from tests.spared import spare
+from tests.spared import SCREEN, defaults, spare
 from vvgt_cli.commands.main import run
 from vvgt_cli.resources import set_memory
 
@@ -50,7 +50,7 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_collection_finish(session: pytest.Session) -> None:
     """Compile kernels on all cores, before the tests ask for them one by one."""
     parallel = hasattr(session.config, "workerinput")  # of pytest-xdist, whose first process has compiled them
-    wanted = os.environ.get("KERNELS_AHEAD") != "0"  # tests/mutants.py: a mutant's are compiled as they are asked for
+    wanted = os.environ.get("KERNELS_AHEAD") != "0"
     if wanted and len(session.items) > 20 and not session.config.getoption("collectonly") and not parallel:
         compile_kernels()
 
@@ -102,6 +102,15 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def small_conversions() -> None:
     """Spare commands in this process what takes most of a small one's time."""
     spare()
+
+
+@pytest.fixture
+def small_screen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Convert for 64 px where no screen is stated, in this process and in those that it starts."""
+    from vvgt_cli.conversion.request import FitOptions
+
+    monkeypatch.setenv(SCREEN, "64")
+    monkeypatch.setattr(FitOptions.__init__, "__defaults__", defaults(64))
 
 
 @pytest.fixture(scope="session")

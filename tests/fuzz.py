@@ -127,9 +127,8 @@ def limits() -> None:
     from vvgt_cli.volume import blocks
     from vvgt_cli.volume.openvdb import tree
     from vvgt_cli.volume.vtk import child as vtk_child
-    from vvgt_cli.volume.vtk import pieces as vtk_pieces
 
-    blocks.free_memory = tree.free_memory = vtk_child.free_memory = vtk_pieces.free_memory = lambda: FREE  # type: ignore[assignment]
+    blocks.free_memory = tree.free_memory = vtk_child.free_memory = lambda: FREE  # type: ignore[assignment]
     pages = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (pages + MEMORY, pages + MEMORY))
 

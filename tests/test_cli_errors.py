@@ -1,7 +1,9 @@
 """Bad calls and bad input: the exit status, one line, and nothing left behind."""
 
+import importlib.metadata
 import json
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,7 @@ from tests.processes import python
 from vvgt_cli import __version__
 from vvgt_cli.commands import main
 from vvgt_cli.commands.options import THREAD_VARIABLES, default_threads
-from vvgt_cli.errors import DataError
+from vvgt_cli.errors import DataError, pip_install
 
 RAW = ("--dims", 8, 8, 8, "--dtype", "uint8")
 
@@ -236,3 +238,14 @@ def test_termination_removes_the_temporary_file(folder):
     before = sorted(folder.iterdir())
     python("-c", code, code=143)
     assert sorted(folder.iterdir()) == before
+
+
+def test_extras_are_installed_by_the_names_of_their_packages(monkeypatch):
+    """What pip is told works where no index has vvgt."""
+    assert re.fullmatch(r"pip install 'dask\[distributed\]>=[\d.]+' 'dask-jobqueue>=[\d.]+'", pip_install("cluster"))
+
+    def none(name):
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(importlib.metadata, "requires", none)
+    assert pip_install("share") == "pip install '.[share]' in the clone"

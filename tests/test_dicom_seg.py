@@ -181,7 +181,7 @@ def test_what_is_no_label_map_is_refused_in_a_line(tmp_path: Path, monkeypatch) 
         refused(DataError, r"cut\.dcm", load, SourceRequest(str(tmp_path / "cut.dcm")))
     monkeypatch.setitem(sys.modules, "highdicom", None)
     for read in (read_volume, read_labels):
-        refused(DataError, r"needs highdicom .*pip install 'vvgt\[dicom-seg\]'", read, str(tmp_path / "s.dcm"))
+        refused(DataError, r"needs highdicom .*pip install 'highdicom>=.*' 'pydicom>=", read, str(tmp_path / "s.dcm"))
 
 
 def test_folders_of_segmentations_and_contours_say_what_to_give(tmp_path: Path) -> None:

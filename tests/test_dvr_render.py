@@ -85,7 +85,7 @@ def test_random_fields_match_the_twin(seed, spacing):
     errors = [np.abs(render_view(scene, camera(), RenderSettings(s, samples=1)) - reference) for s in (1 / 8, 1 / 32)]
     assert errors[1].max() < 1e-3
     assert errors[1].mean() < 5e-5
-    assert errors[0].mean() > 8 * errors[1].mean()  # second order, and towards the twin
+    assert errors[0].mean() > 4 * errors[1].mean()  # towards the twin; longer steps are taken in more parts
 
 
 @pytest.mark.parametrize("size", [(1, 1), (31, 7)])

@@ -1,7 +1,6 @@
 """From files of any orientation to Gaussians, views and back: the right place, the right way round and up."""
 
 import json
-import tarfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from vvgt_cli.gaussians import Gaussians, PlyHeader, in_unit_frame, read_ply
 from vvgt_cli.gaussians.frames import transform
 from vvgt_cli.images.files import read_png
 from vvgt_cli.splat import render
-from vvgt_cli.volume import ReadOptions, read_volume
+from vvgt_cli.volume import read_volume
 
 SMALL = ("--max-gaussians", 400, "--screen", 64, "-q")
 
@@ -78,30 +77,6 @@ def test_world_positions_are_the_same_in_every_format(vvgt, grid: str) -> None:
     lps, header = init(vvgt, "mha.mha", "lps.ply", "--frame", "world", "--space", "LPS")
     np.testing.assert_allclose(lps.means, expected * (-1, -1, 1), atol=1e-3)
     assert header.space == "LPS"
-
-
-TILT = [[1, 0, 0], [0, np.cos(0.3), np.sin(0.3)], [0, -np.sin(0.3), np.cos(0.3)], [0, 0, 0]]
-
-
-@pytest.mark.parametrize(
-    ("grid", "rows"),  # of the files' matrices in tests/fixtures/vdb/write_vdb.cc, which act on rows
-    [("turned", [[0, 2, 0], [-3, 0, 0], [0, 0, 4], [7, 8, 9]]), ("rotated", TILT)],
-)
-def test_openvdb_positions_are_the_transforms(vvgt, grid: str, rows: list[list[float]]) -> None:
-    with tarfile.open(Path(__file__).parent / "fixtures" / "vdb" / "grids.tar.xz") as archive:
-        archive.extractall(filter="data")
-    path = next(Path().rglob("transforms.vdb"))
-    matrix = np.array(rows)
-    spacing = np.linalg.norm(matrix[:3], axis=1)
-    np.save("bare.npy", np.asarray(read_volume(str(path), ReadOptions(array=grid)).data))
-    rescale = ("--tf-range", "rescale")
-    bare, _ = init(vvgt, "bare.npy", "bare.ply", "--spacing", *spacing, *rescale)
-    frame = replace(read_volume("bare.npy"), spacing=tuple(spacing)).unit_frame()
-    index = (bare.means.astype(float) + frame.half) / frame.step - 0.5 + (10, -3, 5)  # the first voxel of the box
-    cloud, header = init(vvgt, path, "a.ply", "--grid", grid, "--frame", "world", *rescale)
-    np.testing.assert_allclose(cloud.means, index @ matrix[:3] + matrix[3], atol=1e-3)
-    assert header.up == "none"
-    assert np.ptp(index[:, 0]) > 3  # spread over the row of voxels
 
 
 def test_a_sheared_volume_is_reported_and_its_balls_are_in_place(vvgt) -> None:

@@ -203,22 +203,6 @@ def test_columns_are_found_by_name(tmp_path: Path, ranges: list[str]) -> None:
         assert same(shaded, read(tmp_path, compressed(ranges, elements="sh vertex chunk", sh=sh)))
 
 
-@pytest.mark.parametrize(
-    ("content", "said"),
-    [
-        (compressed(RANGES, chunks=1), "1 chunks of 256 for 300 vertices"),
-        (compressed(RANGES, form="binary_big_endian 1.0"), "not format binary_little_endian"),
-        (compressed(RANGES)[:-1], "buffer is smaller"),
-        (compressed(RANGES[1:]), "no field of name min_x"),
-        (compressed([*RANGES, *COLORS[:5]]), "no field of name max_b"),
-        (compressed(RANGES).replace(b"element vertex 300", b"element vertex 3e2"), "invalid literal"),
-        (compressed(RANGES).replace(b"end_header", b"end_footer"), "no 'end_header'|not text"),
-    ],
-)
-def test_faulty_compressed_files(tmp_path: Path, content: bytes, said: str) -> None:
-    refused(DataError, said, read, tmp_path, content)
-
-
 def test_our_own_compressed_files_keep_their_comments(tmp_path: Path) -> None:
     stream = io.BytesIO()
     gaussians = read_ply(io.BytesIO(ply(GOOD)))[0]

@@ -377,19 +377,6 @@ def test_the_legend_of_another_look_has_the_unit_that_a_conversion_would_state(t
     assert json.loads(legend)["unit"] == unit
 
 
-def test_a_conversion_in_blocks_is_as_near(vvgt, live_file, tmp_path) -> None:
-    tf, scores, facts = live_file.parent / "tf.json", [], []
-    for number, blocks in enumerate(((), ("--blocks", 16))):
-        out, report = tmp_path / f"{number}.ply", tmp_path / f"{number}.json"
-        source = ("example:marschner-lobb:20", "--live", "--tf", tf, *SMALL, *blocks)
-        vvgt.ok("convert", *source, "-o", out, "--report", report)
-        scores.append(json.loads(report.read_text())["scores"]["psnr"])
-        facts.append(read_ply(out)[1].live)
-    assert scores[0] == pytest.approx(scores[1], abs=0.02)
-    assert facts[0] == facts[1]  # their histogram, too, of which the function needs none
-    assert sorted(path.suffix for path in tmp_path.iterdir()) == [".json", ".json", ".ply", ".ply"]
-
-
 def test_the_library_recolors_results_and_files(live_file, tmp_path, vvgt) -> None:
     result = vvgt_library.convert("example:blob:12", max_gaussians=100, screen=48, live=True)
     assert result.gaussians.live is not None

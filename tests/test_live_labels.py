@@ -235,15 +235,3 @@ def test_what_labels_do_not_go_with(vvgt, label_file, tmp_path) -> None:
     done = vvgt.fails(2, "render", label_file, "--tf-range", "0,1", "--orbit", 1, "-o", tmp_path / "r")
     assert "replace --tf-range" in done
     assert sorted(path.name for path in tmp_path.iterdir()) == ["one.json", "t.json"]
-
-
-def test_a_label_map_in_blocks_is_as_near(vvgt, label_file, tmp_path) -> None:
-    volume, found = label_file.parent / "map_label.npy", []
-    vvgt.ok("convert", volume, "--labels", "auto", "--live", "--blocks", 16, "-o", tmp_path / "b.ply", *SMALL)
-    for file in (label_file, tmp_path / "b.ply"):
-        gaussians = read_ply(file)[0]
-        found.append(
-            (gaussians.means.mean(axis=0), np.bincount(gaussians.live[:, LABEL_ROW].astype(int)) / len(gaussians))
-        )
-    np.testing.assert_allclose(found[0][0], found[1][0], atol=0.02)
-    np.testing.assert_allclose(found[0][1], found[1][1], atol=0.05)

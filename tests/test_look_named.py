@@ -277,21 +277,3 @@ def test_largest_is_the_body_with_most_voxels() -> None:
 def test_blocks_count_for_functions_of_the_histogram(name: str) -> None:
     assert needs_histogram(SourceRequest("v.mrc", tf=name))
     assert not needs_histogram(SourceRequest("v.mrc", tf="viridis"))
-
-
-@pytest.mark.parametrize("tf", [None, "density-contour"])
-def test_contours_in_blocks_are_those_in_memory(tmp_path: Path, vvgt, tf: str | None) -> None:
-    """The same Gaussians, and the same bytes however the map is divided."""
-    source = save(tmp_path / "v.mrc", np.kron(blob(), np.ones((2, 2, 2), np.float32)))
-    files = []
-    for name, blocks in (("whole", ()), ("wide", ("--blocks", 32)), ("fine", ("--blocks", 16))):
-        given = () if tf is None else ("--tf", tf)
-        files.append(tmp_path / f"{name}.ply")
-        vvgt.ok("init", source, "-o", files[-1], "--max-gaussians", 400, *given, *blocks)
-    whole, wide, fine = (path.read_bytes() for path in files)
-    assert wide == fine
-    facts = [json.loads(vvgt("info", path, "--json").out) for path in files]
-    for key, value in facts[0].items():
-        if key in ("gaussians", "unit_distance", "unit_distance_label", "box_min", "box_max", "color_min", "color_max"):
-            assert facts[1][key] == pytest.approx(value, abs=1e-5), key
-    assert len(whole) > 1000

@@ -136,17 +136,6 @@ def test_unit_distance_by_paraview_and_by_spacing():
     assert unit_distance("paraview", box, function(opacity_unit_distance=7))[1] == "paraview"
 
 
-def test_unit_distance_by_paraview_is_vtk_of_the_same_image():
-    from vtkmodules.vtkCommonDataModel import vtkImageData
-
-    image = vtkImageData()
-    image.SetDimensions(17, 9, 5)
-    image.SetSpacing(1, 2, 3)
-    expected = image.GetLength() / image.GetNumberOfCells() ** (1 / 3)
-    volume = Volume(np.zeros((5, 9, 17), np.uint8), spacing=(1, 2, 3))
-    assert unit_distance("paraview", volume)[0] == pytest.approx(expected)
-
-
 def test_unit_distance_of_flat_volumes():
     flat = Volume(np.zeros((1, 9, 9), np.uint8), spacing=(2, 2, 5))
     assert unit_distance("paraview", flat)[0] == pytest.approx(2 * math.sqrt(2))

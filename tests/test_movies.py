@@ -271,7 +271,7 @@ def test_bad_calls_are_one_line(ply, tmp_path, vvgt, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     result = vvgt("render", ply[1], "--orbit", 2, "-o", tmp_path / "a.mp4")
     assert result.code == 1
-    assert "pip install 'vvgt[share]'" in result.error
+    assert "'imageio-ffmpeg>=" in result.error
     assert "read" not in result.err.replace(result.error, "")
 
 

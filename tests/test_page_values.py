@@ -271,8 +271,7 @@ def test_a_lit_page_within_its_size_counts_its_harmonics(vvgt, tmp_path):
     assert max(counts) < 1.1 * min(counts)
 
 
-def test_labels_lie_over_the_scan_and_series_have_none(vvgt, scan, monkeypatch):
-    monkeypatch.setattr("vvgt_cli.conversion.request.SIZE", 32)  # of `view`
+def test_labels_lie_over_the_scan_and_series_have_none(vvgt, scan, small_screen):
     page, layer = scan / "both.html", ("--layer", f"{scan / 'labels.nii.gz'},labels=auto")
     vvgt.ok("convert", scan / "scan.nii.gz", *layer, "--live", "-o", page, *HOW[:4])
     (_, values), (facts, rows) = grids_in(page)

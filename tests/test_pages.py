@@ -154,8 +154,7 @@ def held_bytes(page: Path) -> bytes:
     return content + b"".join(map(base64.b64decode, re.findall(rb'id="(?:splats|values)-\d">([^<]+)<', content)))
 
 
-def test_no_file_names_the_volume_that_it_was_made_of(vvgt, tmp_path, monkeypatch):
-    monkeypatch.setattr("vvgt_cli.conversion.request.SIZE", 32)  # of `view`
+def test_no_file_names_the_volume_that_it_was_made_of(vvgt, tmp_path, small_screen):
     x, y, z = np.mgrid[-1:1:14j, -1:1:14j, -1:1:14j]
     np.save(tmp_path / "Mueller_Hans.npy", np.exp(-3 * (x**2 + y**2 + z**2)))
     np.save(tmp_path / "Mueller_Eva.npy", np.exp(-3 * (x**2 + 2 * y**2 + z**2)))

@@ -11,6 +11,7 @@ import pytest
 import vvgt_cli
 from tests.test_scale import bodies
 from vvgt_cli.cameras import Camera, default_views
+from vvgt_cli.commands.main import run
 from vvgt_cli.conversion.parts import PartTask, Refiner, refine_part
 from vvgt_cli.conversion.request import FitOptions
 from vvgt_cli.dvr import RenderSettings, render_view
@@ -42,10 +43,16 @@ def volume(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def folder(volume: Path) -> Path:
-    from vvgt_cli.commands.main import run
-
     out = volume.parent / "out"
     assert run(["convert", str(volume), *FIT, *STEPS, "--blocks", "64", "-o", str(out / "lod-meta.json")]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def closed(volume: Path) -> Path:
+    """Levels of the closed form."""
+    out = volume.parent / "closed"
+    assert run(["init", str(volume), *FIT, "-o", str(out / "lod-meta.json")]) == 0
     return out
 
 
@@ -163,9 +170,7 @@ def scores(path: Path, *files: Path | str) -> list[float]:
     ]  # fmt: skip
 
 
-def test_every_level_is_nearer_to_the_volume_than_the_closed_form(vvgt, volume: Path, folder: Path) -> None:
-    closed = volume.parent / "closed"
-    vvgt.ok("init", volume, *FIT, "-o", closed / "lod-meta.json")
+def test_every_level_is_nearer_to_the_volume_than_the_closed_form(volume: Path, folder: Path, closed: Path) -> None:
     before, after = (json.loads((place / "lod-meta.json").read_text()) for place in (closed, folder))
     assert after["counts"] == before["counts"]
     assert len(after["counts"]) >= 2
@@ -178,12 +183,13 @@ def test_every_level_is_nearer_to_the_volume_than_the_closed_form(vvgt, volume: 
     assert errors != [node["errors"] for node in before["tree"]["children"]]
 
 
-def test_levels_without_steps_are_the_closed_form(vvgt, volume: Path, tmp_path: Path) -> None:
-    for command, more, name in (("convert", ("--steps", "0"), "a"), ("init", (), "b")):
-        vvgt.ok(command, volume, *FIT, *more, "-o", tmp_path / name / "lod-meta.json")
-    first, second = (files_in(tmp_path / name) for name in "ab")  # of the manifests one has a certificate
+@pytest.mark.parametrize("how", [("--steps", "0"), ("--target-psnr", "5")])
+def test_levels_without_steps_or_at_their_target_are_the_closed_form(vvgt, volume, closed, tmp_path, how) -> None:
+    vvgt.ok("convert", volume, *FIT, *how, "-o", tmp_path / "lod-meta.json")
+    first, second = files_in(tmp_path), files_in(closed)
     assert len(first) == len(second) > 4
-    assert {path for path in first if first[path] != second[path]} == {Path("lod-meta.json")}
+    changed = {path for path in first if first[path] != second.get(path)}
+    assert changed == {Path("lod-meta.json")}  # one has a certificate
 
 
 @pytest.mark.parametrize("scheduler", [(), pytest.param(("--scheduler", "local"), marks=pytest.mark.long)])
@@ -195,11 +201,10 @@ def test_bytes_depend_on_neither_blocks_nor_workers(vvgt, volume, folder, tmp_pa
     assert files_in(tmp_path / "out") == files_in(folder)
 
 
-def test_an_interrupted_refinement_goes_on_where_it_ended(vvgt, volume, folder, tmp_path, monkeypatch) -> None:
-    line = ("convert", volume, *FIT, *STEPS, "-o", tmp_path / "out" / "lod-meta.json", "--blocks", "64")
+def test_an_interrupted_refinement_goes_on_where_it_ended(vvgt, volume, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr("vvgt_cli.conversion.cut.ENOUGH", 1)  # the tiles are regions
-    whole = ("convert", volume, *FIT, *STEPS, "-o", tmp_path / "whole" / "lod-meta.json", "--blocks", "64")
-    vvgt.ok(*whole)
+    line = ("convert", volume, *FIT, "--steps", "4", "--blocks", "64", "-o", tmp_path / "out" / "lod-meta.json")
+    vvgt.ok(*line[:-1], tmp_path / "whole" / "lod-meta.json")
     call, seen = PartTask.__call__, list[int]()
 
     def stopped(task: PartTask, number: int) -> None:
@@ -218,31 +223,19 @@ def test_an_interrupted_refinement_goes_on_where_it_ended(vvgt, volume, folder, 
     assert not list(tmp_path.glob(".*"))
 
 
-def test_a_target_that_is_reached_leaves_the_closed_form(vvgt, volume: Path, tmp_path: Path) -> None:
-    for name, options in (("a", ("--target-psnr", "5")), ("b", ("--steps", "0"))):
-        vvgt.ok("convert", volume, *FIT, *options, "-o", tmp_path / name / "lod-meta.json")
-    manifests = [json.loads((tmp_path / name / "lod-meta.json").read_text()) for name in "ab"]
-    assert manifests[0]["counts"] == manifests[1]["counts"]
-    first, second = (files_in(tmp_path / name) for name in "ab")
-    assert all(first[path] == second[path] for path in first if path.suffix == ".webp")
-
-
-@pytest.mark.parametrize("options", [(), ("--light", "headlight")])
-def test_large_clouds_are_refined_by_regions_in_every_format(vvgt, volume, tmp_path, monkeypatch, options) -> None:
+def test_large_clouds_are_refined_by_regions_lit_in_other_formats(vvgt, volume, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr("vvgt_cli.conversion.request.MANY", 5000)
-    light = options if "--light" in options else ()
-    vvgt.ok("init", volume, *FIT, *light, "-o", tmp_path / "closed.ply")
-    found = vvgt.ok("convert", volume, *FIT[:-1], *STEPS, "--blocks", "32", *options, "-o", tmp_path / "a.ply")
-    assert "refined part by part" in found.err
-    made, closed = (read_splats(str(tmp_path / f"{name}.ply"))[0] for name in ("a", "closed"))
-    assert len(made) == pytest.approx(len(closed), rel=0.03)  # those that no viewer draws are left out
-    assert read_splats(str(tmp_path / "a.ply"))[1].certificate is not None
-    if not light:
-        old, new = scores(volume, tmp_path / "closed.ply", tmp_path / "a.ply")
-        assert new > old + 1
-        vvgt.ok("convert", volume, *FIT, *STEPS, "--blocks", "64", "-o", tmp_path / "a.spz")
-        planned = vvgt.ok("convert", volume, *FIT, *STEPS, "--blocks 64 --dry-run -o", tmp_path / "b.ply").out.decode()
-        assert "parts, " in planned
+    vvgt.ok("init", volume, *FIT, "-o", tmp_path / "closed.ply")
+    for name, options in (("a.ply", STEPS), ("b.spz", ("--steps", "4", "--light", "headlight"))):
+        found = vvgt.ok("convert", volume, *FIT[:-1], "--blocks", "32", *options, "-o", tmp_path / name)
+        assert "refined part by part" in found.err
+        made, closed = (read_splats(str(tmp_path / file))[0] for file in (name, "closed.ply"))
+        assert len(made) == pytest.approx(len(closed), rel=0.03)  # those that no viewer draws are left out
+        assert read_splats(str(tmp_path / name))[1].certificate is not None
+    old, new = scores(volume, tmp_path / "closed.ply", tmp_path / "a.ply")
+    assert new > old + 1
+    planned = vvgt.ok("convert", volume, *FIT, *STEPS, "--blocks 64 --dry-run -o", tmp_path / "c.ply").out.decode()
+    assert "parts, " in planned
     assert not list(tmp_path.glob(".*"))
 
 

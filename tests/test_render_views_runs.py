@@ -8,7 +8,7 @@ import pytest
 from tests.processes import replaced
 from tests.view_sets import BASE, SMALL, TF, VOLUME, make_views
 from vvgt_cli import dvr
-from vvgt_cli.conversion.manifest import Manifest, Shard, read_manifest
+from vvgt_cli.conversion.manifest import read_manifest
 from vvgt_cli.errors import DataError
 
 
@@ -72,17 +72,6 @@ def test_a_run_that_is_killed_goes_on(vvgt, tmp_path, made, monkeypatch):
     assert all(after[path] == stamp for path, stamp in before.items() if path.name != "manifest.json")
     for path in made.rglob("*.exr"):
         assert (tmp_path / "v" / path.relative_to(made)).read_bytes() == path.read_bytes()
-
-
-def test_a_renderer_that_is_not_there_leaves_nothing(vvgt, tmp_path, monkeypatch):
-    from vvgt_cli.dvr import backends
-
-    def refuse(renderer, scene, settings):
-        raise DataError(f"no device for {renderer}")
-
-    monkeypatch.setattr(backends, "view_renderer", refuse)
-    assert "no device for vtk" in vvgt(*BASE, "--renderer", "vtk", "-o", tmp_path / "v").error
-    assert not (tmp_path / "v").exists()
 
 
 def test_views_that_see_nothing_leave_nothing(vvgt, tmp_path):
@@ -164,26 +153,6 @@ def test_shards_together_are_the_whole(vvgt, tmp_path, made):
     after = stamps(folder)
     assert {path: after[path] for path in before} == before
     assert "another" in vvgt("render-views", VOLUME, "--tf", "magma", *SMALL, "-o", folder, "--shard", "1/3").error
-
-
-def test_shards_share_views_out_without_overlap():
-    parts = [[j for j in range(11) if Shard(i, 4).holds(j)] for i in range(1, 5)]
-    assert sorted(j for part in parts for j in part) == list(range(11))
-    assert max(map(len, parts)) - min(map(len, parts)) <= 1
-
-
-def test_complete_needs_the_recorded_bytes(tmp_path):
-    manifest = Manifest(tmp_path, {"a": 1})
-    (tmp_path / "x").write_bytes(b"1234")
-    assert not manifest.complete("x")
-    manifest.record(["x"])
-    assert manifest.complete("x")
-    (tmp_path / "x").write_bytes(b"1235")
-    assert manifest.complete("x", content=False)
-    assert not manifest.complete("x")
-    again = Manifest(tmp_path, {"a": 1})
-    again.open(["x"], overwrite=False)
-    assert again.files == manifest.files
 
 
 def test_no_points_leaves_out_the_cloud_and_nothing_else(vvgt, tmp_path, made):

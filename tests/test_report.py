@@ -102,20 +102,6 @@ def test_a_report_writes_every_file_and_scores_every_run(scene_report):
     assert found["machine"]["cpu"]
 
 
-@pytest.mark.long
-def test_a_report_in_blocks_has_the_same_scores(scene_report, vvgt, tmp_path, monkeypatch):
-    monkeypatch.setattr("vvgt_cli.commands.report_runs.warm_up", lambda *_: None)
-    folder, found = scene_report
-    args = ("example:blob:10", *SMALL, "--model", folder.parent / "worse", "--blocks", 16)
-    assert "in blocks of 16" in vvgt.ok("report", *args, "-o", tmp_path / "out").err
-    blocks = json.loads((tmp_path / "out" / "report.json").read_text())
-    assert "--blocks 16" in blocks["command_line"]
-    assert [run["name"] for run in blocks["runs"]] == [run["name"] for run in found["runs"]]
-    for one, other in zip(found["runs"], blocks["runs"], strict=True):
-        assert one["scores"]["psnr"] == pytest.approx(other["scores"]["psnr"], abs=0.1)
-        assert one["conditions"][0]["psnr"] == pytest.approx(other["conditions"][0]["psnr"], abs=0.3)
-
-
 def test_the_page_opens_offline_and_shows_its_pictures(scene_report):
     folder, found = scene_report
     text = (folder / "report.html").read_text("utf-8")

@@ -38,15 +38,14 @@ def test_slices_of_tiff_are_read_in_blocks_page_by_page(vvgt, tmp_path, coding):
     assert isinstance(plain.data, (Stored, np.memmap))  # neither whole nor a copy of a channel
     assert np.array_equal(plain.data[3:5, 2:9, 1:7], two[3:5, 1, 2:9, 1:7])
     one = ("--channel", "0")
-    for source, more in ((folder, ()), (f"{folder}/*.tif", ()), (tmp_path / "v.ome.tif", ()),
-                         (tmp_path / "two.tif", one), (tmp_path / "plain.tif", one)):  # fmt: skip
+    for source, more in ((folder, ()), (tmp_path / "v.ome.tif", ()), (tmp_path / "two.tif", one),
+                         (tmp_path / "plain.tif", one)):  # fmt: skip
         files = []
-        for blocks in ((), ("--blocks", "16"), ("--blocks", "64")):
+        for blocks in ((), ("--blocks", "16")):
             path = tmp_path / "a.ply"
             vvgt.ok("init", source, "-o", path, *FIT, *more, *blocks, "--overwrite")
             files.append(sorted_rows(path)[1])
-        assert np.array_equal(files[0], files[1])
-        assert np.array_equal(files[0], files[2])
+        assert np.array_equal(*files)
 
 
 def test_slices_that_do_not_fit_together_are_a_line_in_blocks_too(vvgt, tmp_path):

@@ -1,20 +1,16 @@
 """Training: gradients through the splatter, losses, scenes, the loop, and runs that end and go on."""
 
 import csv
-import importlib
-import json
 import os
 import signal
 import subprocess
 import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from network_models import TINY, as_rows, scene
 
 from tests.refused import refused
@@ -24,7 +20,6 @@ from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.constants import DILATION, NEAR
-from vvgt_cli.gaussians.ply import read_ply
 from vvgt_cli.images.metrics import psnr
 from vvgt_cli.images.metrics import ssim as ssim_metric
 from vvgt_cli.network.prepare import pack, unpack
@@ -33,7 +28,6 @@ from vvgt_cli.network.training import scenes as training_scenes
 from vvgt_cli.network.training.scenes import make_scenes, prepare_scenes, recipes
 from vvgt_cli.progress import Console
 from vvgt_cli.splat import project, render, render_reference
-from vvgt_cli.volume import read_volume
 from vvgt_cli.volume.medical.nrrd import write_nrrd
 from vvgt_cli.volume.shapes import make_shape
 
@@ -134,38 +128,6 @@ def test_gsplat_is_handed_the_camera(monkeypatch):
     ours = splat(rows, camera).numpy()
     assert ours[..., 3].max() > 0.5
     np.testing.assert_allclose(gsplat_picture(rows, camera).numpy(), ours, atol=1e-5)
-
-
-def test_training_from_random_points_learns(monkeypatch, tmp_path):
-    """The benchmark's loop with our splatter in place of gsplat's, and none of its moves of Gaussians."""
-
-    def drawn(means, quats, scales, opacities, colors, views, lenses, width, height, packed):
-        (fx, _, cx), (_, fy, cy), _ = lenses[0].tolist()
-        camera = Camera(
-            views[0, :3, :3].double().numpy(), views[0, :3, 3].double().numpy(), fx, fy, cx, cy, width, height
-        )
-        picture = splat(torch.cat([means, scales.log(), quats, opacities.logit()[:, None], colors], dim=1), camera)
-        return picture[None, ..., :3], picture[None, ..., 3:], {}
-
-    strategy = SimpleNamespace(initialize_state=dict, step_post_backward=lambda *given, lr: None)
-    gsplat = SimpleNamespace(rasterization=drawn, MCMCStrategy=lambda cap_max: strategy)
-    monkeypatch.setitem(sys.modules, "gsplat", gsplat)
-    monkeypatch.syspath_prepend(str(Path(__file__).parent.parent / "benchmarks"))
-    bench = importlib.import_module
-    module = bench("gsplat_trainer")
-    for constant, value in {"COUNT": 300, "SIZE": 24, "SCORED": 24, "REPORTED": (1,)}.items():
-        monkeypatch.setattr(module, constant, value)
-    write_nrrd(tmp_path / "blob.nrrd", read_volume("example:blob:10"))
-    points = [{"x": x, "rgb": [1, 0.5, 0], "opacity": x} for x in (0, 1)]
-    (tmp_path / "tf.json").write_text(json.dumps({"range": [0, 1], "points": points}))
-    (tmp_path / "scenes.tsv").write_text("scene\tvolume\toptions\tfunction\nblob\tblob.nrrd\t\ttf.json\n")
-    given = [str(tmp_path / "scenes.tsv"), str(tmp_path), str(tmp_path), "blob", "-o", str(tmp_path / "a.ply")]
-    done = CliRunner().invoke(
-        module.main, [*given, "--steps", "80", "--views", "4", "--device", "cpu"], catch_exceptions=False
-    )
-    first, last = (float(line.split()[-2]) for line in done.output.splitlines() if line.startswith("step"))
-    assert last > first + 3
-    assert len(read_ply(tmp_path / "a.ply")[0]) == 300
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")

@@ -32,7 +32,7 @@ def test_labels_of_another_volume_are_refused() -> None:
             parse_labels(damaged, known)
 
 
-def test_a_volume_is_converted_for_the_labels_of_the_page(tmp_path: Path) -> None:
+def test_a_volume_is_converted_for_the_labels_of_the_page(tmp_path: Path, small_screen: None) -> None:
     np.save(tmp_path / "eight.npy", CUBES)
     source = SourceRequest(str(tmp_path / "eight.npy"), labels="auto", light=LightOptions(("none",)))
     told: list[Message] = []

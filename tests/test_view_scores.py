@@ -57,7 +57,7 @@ def test_the_console_hears_that_a_first_conversion_is_not_scored(capsys: pytest.
     assert "not scored: no memory" in capsys.readouterr().err
 
 
-def test_the_end_of_a_scoring_process_is_reported() -> None:
+def test_the_end_of_a_scoring_process_is_reported(small_screen: None) -> None:
     messages: list[Message] = []
 
     def hear(number: int, message: Message) -> None:

@@ -94,7 +94,9 @@ def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def test_a_volume_is_shown_and_converted_for_the_pages_function(tmp_path: Path, temporary: Path) -> None:
+def test_a_volume_is_shown_and_converted_for_the_pages_function(
+    tmp_path: Path, temporary: Path, small_screen: None
+) -> None:
     folder = tmp_path / "here"
     folder.mkdir()
     with shown("example:blob:12", "--tf", "viridis", folder=folder) as (child, url):
@@ -147,7 +149,7 @@ def test_a_volume_is_shown_and_converted_for_the_pages_function(tmp_path: Path, 
     assert list(temporary.iterdir()) == list(folder.iterdir()) == []
 
 
-def test_colours_are_offered_no_values(tmp_path: Path, temporary: Path) -> None:
+def test_colours_are_offered_no_values(tmp_path: Path, temporary: Path, small_screen: None) -> None:
     nib = pytest.importorskip("nibabel")
     data = np.zeros((8, 8, 8), np.dtype([(c, np.uint8) for c in "RGB"]))
     data["R"][2:6, 2:6, 2:6] = 200
@@ -382,7 +384,7 @@ def test_names_to_save_under() -> None:
     assert plain_name("a/head.compressed.ply") == plain_name("head.ply") == plain_name("head.spz") == "head"
 
 
-def test_a_series_is_shown_frame_by_frame_and_saved_as_a_page(tmp_path, vvgt, monkeypatch) -> None:
+def test_a_series_is_shown_frame_by_frame_and_saved_as_a_page(tmp_path, vvgt, monkeypatch, small_screen) -> None:
     shown: list[tuple[list[str], list[float]]] = []
 
     def serve(run, clouds, *how) -> None:

@@ -76,24 +76,6 @@ def test_choices_that_are_missing_or_wrong(tmp_path: Path, write: Callable, name
             read_volume(path, ReadOptions(**{"component": 0, "time": 0, **wrong}))
 
 
-@formats
-def test_cut_files_end_in_one_line(tmp_path: Path, write: Callable, name: str) -> None:
-    write(tmp_path / name, cells())
-    data = (tmp_path / name).read_bytes()
-    for share in (0.05, 0.5, 0.99):
-        (tmp_path / name).write_bytes(data[: int(len(data) * share)])
-        refused(DataError, name, read_volume, str(tmp_path / name), ReadOptions(component=0))
-
-
-@formats
-def test_one_channel_in_blocks_as_in_memory(vvgt, tmp_path: Path, write: Callable, name: str) -> None:
-    write(tmp_path / name, cells(channels=1))
-    for blocks, out in (((), "a.ply"), (("--blocks", 16), "b.ply")):
-        extra = ("--level", "full") if blocks and name == "a.ims" else ()
-        vvgt.ok("init", tmp_path / name, *SMALL[:4], *blocks, *extra, "-o", tmp_path / out)
-    assert (tmp_path / "a.ply").stat().st_size > 1000
-
-
 def test_a_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import sys
 
@@ -101,7 +83,7 @@ def test_a_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         data = microscopes.lif([("a", cells())]) if name == "a.lif" else microscopes.nd2(cells())
         (tmp_path / name).write_bytes(data)
         monkeypatch.setitem(sys.modules, module, None)
-        refused(DataError, r"pip install 'vvgt\[microscopy\]'", read_volume, str(tmp_path / name))
+        refused(DataError, rf"pip install .*'{module}>=", read_volume, str(tmp_path / name))
 
 
 # ---- several images

@@ -61,16 +61,6 @@ def test_mgh_frames_are_a_series(tmp_path: Path, suffix: str) -> None:
     np.testing.assert_array_equal(xyz(read_volume(source, ReadOptions(time=1))), 2 * VALUES)
 
 
-def test_mgh_lies(tmp_path: Path) -> None:
-    path = tmp_path / "v.mgh"
-    nib.save(nib.MGHImage(VALUES.astype("f4"), np.eye(4)), str(path))
-    content = path.read_bytes()
-    path.write_bytes(content[:300])
-    refused(DataError, "check that the file is whole", read_volume, str(path))
-    path.write_bytes(content[:20] + b"\0\0\0\x07" + content[24:])
-    refused(DataError, "named like a MGH file", read_volume, str(path))
-
-
 FREESURFER = (
     "#No. Label Name: R G B A\n0 Unknown 0 0 0 0\n17 Left-Hippocampus 220 216 20 0\n53 Right-Hippocampus 220 216 20 0\n"
 )
@@ -203,12 +193,6 @@ def test_minc_vectors_are_components(tmp_path: Path, axes: str, version: int) ->
         np.testing.assert_allclose(norm.data[:], np.linalg.norm(expected, axis=0), rtol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["minc1_1_scale.mnc", "minc2_1_scale.mnc"])
-def test_minc_cut_short(tmp_path: Path, name: str) -> None:
-    (tmp_path / name).write_bytes((MINC / name).read_bytes()[:-3000])
-    refused(DataError, "whole", read_volume, str(tmp_path / name))
-
-
 def sequence(kinds: str = "list domain domain domain") -> bytes:
     """A sequence as 3D Slicer writes it: three frames, the values of a voxel one behind the other."""
     text = (
@@ -246,16 +230,9 @@ def test_other_lists_are_components(tmp_path: Path) -> None:
     np.testing.assert_array_equal(xyz(read_volume(str(tmp_path / "v.nrrd"), ReadOptions(component=1))), VALUES + 1000)
 
 
-def test_a_sequence_becomes_a_file_a_frame(tmp_path: Path, vvgt) -> None:
-    (tmp_path / "v.seq.nrrd").write_bytes(sequence())
-    few = ("--max-gaussians", 50, "--screen", 32, "--steps", 0)
-    vvgt.ok("convert", tmp_path / "v.seq.nrrd", "-o", tmp_path / "p_{}.ply", *few)
-    assert sorted(path.name for path in tmp_path.glob("*.ply")) == ["p_0.ply", "p_1.ply", "p_2.ply"]
-
-
 def test_minc_2_without_h5py_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "h5py", None)
-    refused(DataError, r"needs h5py .*pip install 'vvgt\[hdf5\]'", read_volume, str(MINC / "minc2_1_scale.mnc"))
+    refused(DataError, r"needs h5py .*pip install 'h5py>=[\d.]+'$", read_volume, str(MINC / "minc2_1_scale.mnc"))
 
 
 @pytest.mark.parametrize("code", ["u1", "i2", "f4"])

@@ -1,7 +1,5 @@
 """Maps and scans in blocks: the same Gaussians as in memory; what their files hold, and their time steps."""
 
-import gzip
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,7 +13,6 @@ import pyvista
 pytestmark = pytest.mark.filterwarnings("ignore:.*Analyze does not say")
 Z, Y, X = np.indices((40, 36, 44))
 BALL = 100 * np.exp(-((X - 15) ** 2 + (Y - 18) ** 2 + (Z - 22) ** 2) / 60)  # z, y, x
-MINC = Path(nib.__file__).parent / "tests" / "data" / "minc2_4d.mnc"
 
 
 def mrc(path: Path, values: np.ndarray, **words: object) -> Path:
@@ -26,17 +23,8 @@ def mrc(path: Path, values: np.ndarray, **words: object) -> Path:
     return path
 
 
-def turned(folder: Path) -> Path:
-    return mrc(folder / "v.map", BALL.astype(">i1"), mapc=2, mapr=3, maps=1, nxstart=-9)
-
-
 def stack(folder: Path) -> Path:
     return mrc(folder / "v.mrc", np.stack([0 * BALL, BALL]).astype("f4"))
-
-
-def zipped(folder: Path) -> Path:
-    (folder / "v.mrc.gz").write_bytes(gzip.compress(mrc(folder / "w.mrc", BALL.astype("f2")).read_bytes()))
-    return folder / "v.mrc.gz"
 
 
 def cube(folder: Path) -> Path:
@@ -67,16 +55,6 @@ def analyze(folder: Path) -> Path:
     return folder / "v.hdr"
 
 
-def sequence(folder: Path) -> Path:
-    head = (
-        "NRRD0005\ntype: float\ndimension: 4\nspace: left-posterior-superior\nsizes: 2 44 36 40\n"
-        "space directions: none (1,0,0) (0,1,0) (0,0,1)\nkinds: list domain domain domain\nendian: little\n"
-        "encoding: raw\n\n"
-    )
-    (folder / "v.seq.nrrd").write_bytes(head.encode() + np.stack([0 * BALL, BALL], -1).astype("<f4").tobytes())
-    return folder / "v.seq.nrrd"
-
-
 def netcdf(folder: Path) -> Path:
     with netCDF4.Dataset(folder / "v.nc", "w") as file:
         for name, size in zip("zyx", BALL.shape, strict=True):
@@ -90,45 +68,6 @@ def vti(folder: Path) -> Path:
     image["ball"] = BALL.astype("f4").ravel()
     image.save(folder / "v.vti")
     return folder / "v.vti"
-
-
-CASES: dict[str, tuple[Callable[[Path], Path], tuple]] = {
-    "mrc turned": (turned, ()),
-    "mrc stack": (stack, ("--time", 1)),
-    "mrc gzip": (zipped, ()),
-    "cube": (cube, ()),
-    "dx": (dx, ()),
-    "mgh": (mgh, ()),
-    "mgz": (lambda folder: mgh(folder, "v.mgz"), ()),
-    "analyze": (analyze, ()),
-    "sequence": (sequence, ("--time", 1)),
-    "minc": (lambda folder: MINC, ("--time", 1)),
-    "minc 1": (lambda folder: MINC.with_name("minc1_4d.mnc"), ("--time", 1)),
-    "netcdf": (netcdf, ()),
-    "vti": (vti, ()),
-}
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_blocks_give_the_same_gaussians(case: str, tmp_path: Path, vvgt) -> None:
-    make, options = CASES[case]
-    source, facts = make(tmp_path), []
-    for blocks in ((), ("--blocks", 16)):
-        out = tmp_path / f"o{len(blocks)}.ply"
-        vvgt.ok("init", source, "-o", out, "--max-gaussians", 200, "--frame", "world", *options, *blocks)
-        facts.append(json.loads(vvgt("info", out, "--json").out))
-    assert facts[0]["gaussians"] > 20
-    for key in ("gaussians", "affine", "box_min", "box_max", "unit_distance"):
-        np.testing.assert_allclose(facts[1][key], facts[0][key], rtol=1e-5, atol=1e-4, err_msg=key)
-
-
-@pytest.mark.parametrize(("case", "steps"), [("mrc stack", 2), ("sequence", 2), ("minc", 2)])
-def test_info_counts_time_steps_and_says_what_is_in_one(case: str, steps: int, tmp_path: Path, vvgt) -> None:
-    source = CASES[case][0](tmp_path)
-    assert json.loads(vvgt("info", source, "--json").out)["time_steps"] == steps
-    facts = json.loads(vvgt("info", source, "--json", "--time", 1).out)
-    assert facts["kind"] == "volume"
-    assert facts["range"][1] > facts["range"][0]
 
 
 def test_workers_do_not_repeat_what_is_said_of_a_file(tmp_path: Path, vvgt) -> None:
@@ -147,9 +86,3 @@ def test_packed_values_give_the_bytes_of_plain_ones(make: Callable, tmp_path: Pa
         how = ("--max-gaussians", 200, "--blocks", 32, *more, "--no-comments")
         vvgt.ok("init", source, "-o", files[-1], *how)
     assert files[0].read_bytes() == files[1].read_bytes()
-
-
-def test_a_stack_of_maps_becomes_a_file_each(tmp_path: Path, vvgt) -> None:
-    source = mrc(tmp_path / "v.mrc", np.stack([BALL[:8], 2 * BALL[:8]]).astype("f4"))
-    vvgt.ok("convert", source, "-o", tmp_path / "p_{}.ply", "--max-gaussians", 50, "--screen", 32, "--steps", 0)
-    assert sorted(path.name for path in tmp_path.glob("*.ply")) == ["p_0.ply", "p_1.ply"]

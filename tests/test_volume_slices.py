@@ -157,7 +157,7 @@ def test_dicom_refusals(tmp_path: Path, changes: dict, message: str) -> None:
 def test_dicom_without_its_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_series(tmp_path / "scan")
     monkeypatch.setitem(sys.modules, "pydicom", None)
-    refused(DataError, r"needs pydicom .*pip install 'vvgt\[dicom\]'", read_volume, str(tmp_path / "scan"))
+    refused(DataError, r"needs pydicom .*pip install 'nibabel>=5' 'pydicom>=3'$", read_volume, str(tmp_path / "scan"))
 
 
 def write_slices(folder: Path, values: np.ndarray) -> None:

@@ -11,7 +11,6 @@ import SimpleITK
 
 import vvgt_cli as vvgt
 from tests.refused import refused
-from vvgt_cli.closed_form import values_back
 from vvgt_cli.closed_form.gaussian_samples import NARROW, offsets
 from vvgt_cli.closed_form.values_back import Bells, LiveValues, sample
 from vvgt_cli.conversion.place import to_unit_frame, with_place
@@ -169,8 +168,8 @@ def test_another_grid_is_in_the_same_box_or_that_of_a_volume(file: Path) -> None
 
 def test_slabs_change_nothing(monkeypatch) -> None:
     whole = linear(grid()).voxelize().data
-    monkeypatch.setattr(values_back, "AT_ONCE", 3 * 8 * 120)
-    assert len(list(values_back.slabs(DIMS, 2))) == 3
+    monkeypatch.setattr(writers, "AT_ONCE", 3 * 16 * 120)
+    assert len(list(writers.slabs(DIMS))) == 3
     np.testing.assert_array_equal(linear(grid()).voxelize().data, whole)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.errors import DataError, UsageError, pip_install
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
@@ -61,7 +61,7 @@ def chosen(device: str) -> str:
     if device == "auto":
         return "cuda" if gpu is not None and gpu.free >= FREE * gpu.total else "cpu"
     if absent:
-        raise UsageError(f"--device cuda needs {', '.join(absent)}: pip install 'vvgt[cuda]', or use --device cpu")
+        raise UsageError(f"--device cuda needs {', '.join(absent)}: {pip_install('cuda')}, or use --device cpu")
     if gpu is None:
         raise DataError("--device cuda: no CUDA device found; check the driver (nvidia-smi), or use --device cpu")
     return "cuda"
@@ -70,7 +70,7 @@ def chosen(device: str) -> str:
 def describe() -> str:
     """Return what there is of a GPU, for people."""
     if absent := missing():
-        return f"none that could be used: {', '.join(absent)} not installed (pip install 'vvgt[cuda]')"
+        return f"none that could be used: {', '.join(absent)} not installed ({pip_install('cuda')})"
     gpu = first_gpu()
     return "none found" if gpu is None else gpu.text()
 

@@ -1,6 +1,19 @@
 """Errors that users meet; each message says what was read, what was expected, and what to try."""
 
+import re
 from collections.abc import Sequence
+
+
+def pip_install(extra: str) -> str:
+    """Return the command that installs the packages of an extra of vvgt, by their names: no index need have vvgt."""
+    from importlib.metadata import PackageNotFoundError, requires
+
+    try:
+        lines = requires("vvgt") or []
+    except PackageNotFoundError:  # run from a clone
+        return f"pip install '.[{extra}]' in the clone"
+    found = [line.partition(";")[0].strip() for line in lines if re.search(rf"""extra == ['"]{extra}['"]""", line)]
+    return " ".join(["pip install", *(f"'{package}'" for package in found)])
 
 
 class VvgtError(Exception):

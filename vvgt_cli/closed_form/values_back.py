@@ -8,22 +8,22 @@ is missing is added to means and slopes, `PASSES` times, each with `MOMENTUM` of
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from vvgt_cli.closed_form.gaussian_samples import NARROW, offsets
+from vvgt_cli.dvr.kernel import sample as interpolated
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.frames import axes_of
 from vvgt_cli.gaussians.live import SPREAD, VALUE, directions
 from vvgt_cli.jit.decorators import parallel_kernel
 from vvgt_cli.jit.threads import ThreadSlice, iterations
+from vvgt_cli.volume.writers import slabs
 
 SOFT = 0.15  # voxels by which bells of values are widened, in quadrature, so that none falls between voxels
 PASSES, MOMENTUM = 4, 0.5
 PLANES = 4  # that one iteration of a thread fills
-AT_ONCE = 128 << 20  # bytes of sums
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class LiveValues:
         step, turn, now, before, least = np.zeros(len(means)), np.zeros_like(rises), self, self, np.inf
         for _ in range(passes):
             sums = np.zeros((len(means), 8))  # count, sum, sums of value times point and of points
-            for planes in slabs(dims, 2):
+            for planes in slabs(dims):
                 more = range(planes.start, min(planes.stop + 1, dims[2]))  # points between two slabs
                 sample(self.bells.centres, self.bells.arms, points, now.on(self.bells, dims, more), more.start,
                        planes.stop, dims[2], sums)  # fmt: skip
@@ -117,14 +117,6 @@ class LiveValues:
             means, rises = means + step, rises + turn
             now = LiveValues(self.bells, means, rises, self.background, self.reach)
         return now
-
-
-def slabs(dims: tuple[int, int, int], fields: int) -> Iterator[range]:
-    """Yield the planes of a grid in slabs whose sums of ``fields`` take `AT_ONCE` bytes, or one plane."""
-    nx, ny, nz = dims
-    deep = max(AT_ONCE // (4 * fields * nx * ny), 1)
-    for z in range(0, nz, deep):
-        yield range(z, min(z + deep, nz))
 
 
 @parallel_kernel("f8:2 f8:3 f8:2 f8:2 f8:2 f8 i8 b1 f4:4", error_model="numpy")
@@ -191,18 +183,10 @@ def sample(
             z = centres[k, 2] + (arms[k, 2, 0] * p + arms[k, 2, 1] * q + arms[k, 2, 2] * r)
             if not (-0.5 <= x < nx - 0.5 and -0.5 <= y < ny - 0.5 and -0.5 <= z < depth - 0.5):
                 continue
-            x, y, z = min(max(x, 0.0), nx - 1.0), min(max(y, 0.0), ny - 1.0), min(max(z, 0.0), depth - 1.0)
-            i, j, n = int(x), int(y), int(z)
-            if n < first or n >= stop:
+            z = min(max(z, 0.0), depth - 1.0)
+            if not first <= z < stop:
                 continue
-            u, v, w = x - i, y - j, z - n
-            i1, j1, n1 = min(i + 1, nx - 1), min(j + 1, ny - 1), min(n + 1, depth - 1) - first
-            n -= first
-            a = (values[n, j, i] * (1 - u) + values[n, j, i1] * u) * (1 - v)
-            b = (values[n1, j, i] * (1 - u) + values[n1, j, i1] * u) * (1 - v)
-            a += (values[n, j1, i] * (1 - u) + values[n, j1, i1] * u) * v
-            b += (values[n1, j1, i] * (1 - u) + values[n1, j1, i1] * u) * v
-            value, row = a * (1 - w) + b * w, out[k]
+            value, row = interpolated(values, x, y, z - first), out[k]
             row[0] += 1
             row[1] += value
             row[2] += value * p

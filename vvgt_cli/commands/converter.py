@@ -27,6 +27,8 @@ from vvgt_cli.gaussians.formats.page_values import Values
 from vvgt_cli.look import LabelTable, LightOptions, TransferFunction
 from vvgt_cli.resources import kill_group, memory_limit
 
+START = ("-c", f"from {__package__}.converter_process import main; main()")  # of Python, for the process
+
 
 @dataclass(frozen=True)
 class ConsoleLine:
@@ -157,7 +159,7 @@ class Converter:
         folder = cast(str, self._folder)
         paths = os.pathsep.join(filter(None, [str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")]))
         self._process = subprocess.Popen(
-            [sys.executable, "-c", f"from {__package__}.converter_process import main; main()", folder],
+            [sys.executable, *START, folder],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True,
             env={**os.environ, "PYTHONPATH": paths, "TMPDIR": folder, "TEMP": folder, "TMP": folder},
         )  # fmt: skip

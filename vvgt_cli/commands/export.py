@@ -21,20 +21,20 @@ def command(checkpoint: str, output: str, storage: str, overwrite: bool, console
     """Write the network of CHECKPOINT as two ONNX graphs and a model card.
 
     Before the folder is created, onnxruntime is compared with torch on random scenes; the largest difference is
-    recorded in the card. Requires torch, onnx and onnxscript: install vvgt[train].
+    recorded in the card. Requires torch, onnx and onnxscript, of the extra train.
 
     Example:
       vvgt export run/best.pt -o models/small --storage float16
     """
     import time
 
-    from vvgt_cli.errors import UsageError
+    from vvgt_cli.errors import UsageError, pip_install
 
     try:
         import onnxscript  # noqa: F401
         import torch  # noqa: F401
     except ImportError as error:
-        raise UsageError(f"vvgt export needs {error.name}; install vvgt[train]") from None
+        raise UsageError(f"vvgt export needs {error.name}; try: {pip_install('train')}") from None
     from vvgt_cli.network.export import export_model
 
     began = time.perf_counter()

@@ -24,7 +24,7 @@ from vvgt_cli.conversion.manifest import Shard
 from vvgt_cli.conversion.opened import opened_upright
 from vvgt_cli.conversion.recolored import MIP, NAMES, XRAY, Draw, draw_gaussians, grey, recolored
 from vvgt_cli.conversion.request import ConvertRequest
-from vvgt_cli.errors import DataError, SeveralSteps, UsageError
+from vvgt_cli.errors import DataError, SeveralSteps, UsageError, pip_install
 from vvgt_cli.field.blocked import Blocked
 from vvgt_cli.field.field import Field, Resident
 from vvgt_cli.field.grid import Boxes
@@ -445,7 +445,7 @@ def _ffmpeg(source: str) -> Any:
         import imageio_ffmpeg
     except ImportError as error:
         raise DataError(
-            f"{source}: .mp4 needs imageio_ffmpeg ({error}); try: pip install 'vvgt[share]', or .gif"
+            f"{source}: .mp4 needs imageio_ffmpeg ({error}); try: {pip_install('share')}, or .gif"
         ) from None
     return imageio_ffmpeg
 

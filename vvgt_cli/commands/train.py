@@ -26,8 +26,8 @@ def command(data: str, output: str, path: str | None, console: Console) -> None:
     step), held.csv (one row per evaluation), last.pt, best.pt, and tensorboard/ if TensorBoard is installed.
 
     After SIGTERM or Ctrl-C the current step is saved; run the same command again to resume with identical results. To
-    use several processes: torchrun --nproc-per-node N -m vvgt_cli.commands.main train ... Requires torch and PyYAML:
-    install vvgt[train].
+    use several processes: torchrun --nproc-per-node N -m vvgt_cli.commands.main train ... Requires torch and PyYAML,
+    of the extra train.
 
     Example:
       mkdir -p data/train data/held
@@ -39,13 +39,13 @@ def command(data: str, output: str, path: str | None, console: Console) -> None:
     import sys
 
     from vvgt_cli.commands.process import ending
-    from vvgt_cli.errors import UsageError
+    from vvgt_cli.errors import UsageError, pip_install
 
     try:
         import torch  # noqa: F401
         import yaml  # noqa: F401
     except ImportError as error:
-        raise UsageError(f"vvgt train needs {error.name}; install vvgt[train]") from None
+        raise UsageError(f"vvgt train needs {error.name}; try: {pip_install('train')}") from None
     from vvgt_cli.network.training.config import TrainConfig, read_config
     from vvgt_cli.network.training.loop import train
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -135,18 +135,14 @@ def live_planes(name: str, header: FileFacts, gaussians: Gaussians, layer: int |
 
 
 def _values(name: str, header: FileFacts, gaussians: Gaussians, facts: LiveFacts, grid: Volume) -> Planes:
-    from vvgt_cli.closed_form.values_back import Bells, LiveValues, slabs
+    from vvgt_cli.closed_form.values_back import Bells, LiveValues
 
     place, background = np.linalg.inv(place_of(header)), background_of(facts)
-    own = Bells.of(gaussians, place @ grid_of(name, header).affine)
+    own, bells = (Bells.of(gaussians, place @ one.affine) for one in (grid_of(name, header), grid))
     values = LiveValues.of(gaussians, own, background).refined(facts.dims)
-    bells = Bells.of(gaussians, place @ grid.affine)
-
-    def make() -> Iterator[np.ndarray]:
-        for planes in slabs(grid.dims, 2):
-            yield values.on(bells, grid.dims, planes).clip(facts.lo, facts.hi)
-
-    return Planes(grid, FLOAT, 1, make, background)
+    return Planes(
+        grid, FLOAT, 1, lambda planes: values.on(bells, grid.dims, planes).clip(facts.lo, facts.hi), background
+    )
 
 
 def background_of(facts: LiveFacts) -> float:
@@ -159,7 +155,7 @@ def background_of(facts: LiveFacts) -> float:
 
 def _labels(name: str, header: FileFacts, gaussians: Gaussians, facts: LiveFacts, grid: Volume) -> Planes:
     """Return the label of the nearest body at each voxel, by the bells' greatest, and 0 outside of all."""
-    from vvgt_cli.closed_form.values_back import SOFT, Bells, slabs
+    from vvgt_cli.closed_form.values_back import SOFT, Bells
 
     assert gaussians.live is not None
     numbers = np.array([label.number for label in facts.labels])
@@ -169,9 +165,8 @@ def _labels(name: str, header: FileFacts, gaussians: Gaussians, facts: LiveFacts
     smallest, largest = min(numbers.min(), 0), numbers.max()
     dtype = np.dtype(np.uint8 if largest < 256 else np.uint16) if smallest == 0 and largest < 65536 else np.dtype("i4")
 
-    def make() -> Iterator[np.ndarray]:
-        for planes in slabs(grid.dims, 2):
-            yield bells.sums(fields, slopes, grid.dims, planes, SOFT, LABEL_REACH, True)[..., 1].astype(dtype)
+    def make(planes: range) -> np.ndarray:
+        return bells.sums(fields, slopes, grid.dims, planes, SOFT, LABEL_REACH, True)[..., 1].astype(dtype)
 
     return Planes(grid, dtype, 1, make)
 
@@ -181,7 +176,7 @@ def density_planes(header: FileFacts, gaussians: Gaussians, grid: Volume) -> Pla
 
     A Gaussian's optical mass is what `vvgt_cli.gaussians.opacity` takes its opacity from, along its three axes.
     """
-    from vvgt_cli.closed_form.values_back import Bells, slabs
+    from vvgt_cli.closed_form.values_back import Bells
 
     place = place_of(header)
     bells = Bells.of(gaussians, np.linalg.inv(place) @ grid.affine)
@@ -192,11 +187,10 @@ def density_planes(header: FileFacts, gaussians: Gaussians, grid: Volume) -> Pla
     fields = np.concatenate([np.ones((len(peak), 1)), gaussians.colors.clip(0, None)], axis=1) * peak[:, None]
     slopes = np.zeros((len(peak), 3))
 
-    def make() -> Iterator[np.ndarray]:
-        for planes in slabs(grid.dims, 4):
-            sums = bells.sums(fields, slopes, grid.dims, planes, DENSE_SOFT, DENSE_REACH)
-            sums[..., 1:] /= np.where(sums[..., :1] > 0, sums[..., :1], 1)
-            yield sums
+    def make(planes: range) -> np.ndarray:
+        sums = bells.sums(fields, slopes, grid.dims, planes, DENSE_SOFT, DENSE_REACH)
+        sums[..., 1:] /= np.where(sums[..., :1] > 0, sums[..., :1], 1)
+        return sums
 
     return Planes(replace(grid, value_unit=f"1/{grid.unit or 'mm'}" if grid.unit or grid.space else ""), FLOAT, 4, make)
 

@@ -20,7 +20,8 @@ from vvgt_cli.jit.decorators import inlined
 OPAQUE = 1e-3  # times step^2, as the error of integration goes: the transmittance at which a ray ends
 SUB_DEPTH = 1.0  # optical depth of a sub-segment: colour is constant within one; 0.3 is no more accurate
 PARTS = 32  # the most sub-segments; at the largest extinctions what lies behind the first few is not seen
-FINER = 8  # parts of a segment along which extinction is not flat
+FINER, CURVED = 8, 4  # parts of a segment along which extinction is not flat; not even, and the scalar not linear
+BENT = 0.1  # share of the values met that lies beyond the ends of a segment from which on the scalar is not linear
 FAINT = 0.05  # transmittance behind which no segment is sampled finer
 BEND = 0.5  # times the second difference of samples: by how much the scalar leaves the line between two of them
 AROUND = 0.25  # times the range of a run: how near to something visible it is looked at
@@ -150,9 +151,9 @@ def composite(u0: float, u1: float, dt: float, optics: Optics, light: Quad, tran
 
 @_jit
 def is_flat(optics: Optics) -> bool:
-    """Return whether no segment needs finer samples: the whole function is flat."""
-    flat: bool = optics.flat[0] >= optics.flat.shape[0] - 1
-    return flat
+    """Return whether no segment needs finer samples: extinction is even at all values."""
+    even: bool = optics.even[0] >= optics.even.shape[0] - 1
+    return even
 
 
 @_jit
@@ -174,19 +175,25 @@ def pass_segment(
     voxels: Voxels, optics: Optics, p: Vector, d: Vector, t: float, dt: float, u0: float, u1: float,
     met: tuple[float, float], light: Quad, trans: float,
 ) -> tuple[Quad, float, float]:  # fmt: skip
-    """Apply `composite` from t to t + dt of the ray p + t d; in `FINER` parts if extinction is not flat.
+    """Apply `composite` from t to t + dt of the ray p + t d; in parts if extinction is not flat (`FINER`, `CURVED`).
 
     ``met``: `values_met`. Last is the t at which, on average, the segment absorbs.
     """
-    if trans < FAINT or is_flat(optics) or met[1] <= optics.flat[U(int(met[0]))]:
+    parts, bin_ = 1, U(int(met[0]))
+    if trans >= FAINT and met[1] > optics.even[bin_]:
+        if met[1] > optics.flat[bin_]:
+            parts = FINER
+        elif met[1] - max(u0, u1) > BENT * (met[1] - met[0]):
+            parts = CURVED
+    if parts == 1:
         light, trans = composite(u0, u1, dt, optics, light, trans)
         return light, trans, t + 0.5 * dt
-    (px, py, pz), (dx, dy, dz), part = p, d, dt / FINER
+    (px, py, pz), (dx, dy, dz), part = p, d, dt / parts
     a, whole, place = u0, trans, 0.0
-    for n in range(1, FINER + 1):
+    for n in range(1, parts + 1):
         s = t + n * part
         b = u1
-        if n < FINER:
+        if n < parts:
             b = table_coordinate(sample(voxels.values, px + s * dx, py + s * dy, pz + s * dz), optics)
         if min(a, b) >= 0.0 and max(a, b) > optics.dark[U(int(min(a, b)))]:
             ahead = trans

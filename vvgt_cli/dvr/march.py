@@ -43,6 +43,7 @@ from vvgt_cli.jit.decorators import inlined, parallel_kernel
 from vvgt_cli.jit.threads import ThreadSlice, iterations, next_iteration
 
 P = ParamSpec("P")
+SHADED_TWICE = 0.03  # of a pixel: a normal of noisy data turns within half a voxel
 LEAP = 8  # samples of a grid between two looks at the empty-space map
 
 _jit = inlined(fastmath=FLAGS, error_model="numpy", borrowed=True)
@@ -51,16 +52,25 @@ _exact = inlined(error_model="numpy", borrowed=True)  # the same on both sides o
 
 @_jit
 def shade_segment(
-    own: Quad, light: Light, values: np.ndarray, p: Vector, d: Vector, look: Vector, s: float
+    own: Quad, light: Light, values: np.ndarray, p: Vector, d: Vector, look: Vector, s: float, dt: float
 ) -> tuple[float, float, float]:
-    """Shade a segment's ``own`` (r, g, b, alpha) at p + s d, seen along ``look``; no colour exceeds its alpha."""
-    r, g, b, white = shading(
-        values, light, p[0] + s * d[0], p[1] + s * d[1], p[2] + s * d[2], look[0], look[1], look[2]
-    )  # fmt: skip
+    """Shade a segment's ``own`` (r, g, b, alpha), seen along ``look``; no colour exceeds its alpha.
+
+    It is of length dt and absorbs, on average, at p + s d: light is taken there, or as the mean of a quarter of dt
+    before and behind, where the segment shows more than `SHADED_TWICE`.
+    """
     most = lane(own, 3)
-    white *= most
-    red, green = min(r * lane(own, 0) + white, most), min(g * lane(own, 1) + white, most)
-    return red, green, min(b * lane(own, 2) + white, most)
+    times, apart = (2, 0.5 * dt) if most > SHADED_TWICE else (1, 0.0)
+    red = green = blue = 0.0
+    for n in range(times):
+        at = s + (n - 0.5) * apart
+        r, g, b, white = shading(
+            values, light, p[0] + at * d[0], p[1] + at * d[1], p[2] + at * d[2], look[0], look[1], look[2]
+        )  # fmt: skip
+        white *= most
+        red, green = red + min(r * lane(own, 0) + white, most), green + min(g * lane(own, 1) + white, most)
+        blue += min(b * lane(own, 2) + white, most)
+    return red / times, green / times, blue / times
 
 
 @_jit
@@ -97,7 +107,7 @@ def _through_values(
                     else:
                         own, trans, s = pass_segment(voxels, optics, p, d, here, dt, u0, u1, met, zeros4(), trans)
                         if lane(own, 3) > 0.0:
-                            r, g, b_ = shade_segment(own, light, voxels.values, p, d, look, s)
+                            r, g, b_ = shade_segment(own, light, voxels.values, p, d, look, s, dt)
                             red, green, blue = red + r, green + g, blue + b_
                     if trans < opaque:
                         break
@@ -140,7 +150,7 @@ def _through_texels(
                 seen, trans = blend_texels(a, b, dt, seen, trans)
             else:
                 own, trans = blend_texels(a, b, dt, zeros4(), trans)
-                r, g, b_ = shade_segment(own, light, voxels.values, p, d, look, t - 0.5 * dt)
+                r, g, b_ = shade_segment(own, light, voxels.values, p, d, look, t - 0.5 * dt, dt)
                 red, green, blue = red + r, green + g, blue + b_
         a, known = b, True
         i += 1

@@ -17,7 +17,7 @@ from multiprocessing import get_context
 from threading import Thread
 from typing import TYPE_CHECKING, Any, Protocol, Self
 
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.errors import DataError, UsageError, pip_install
 from vvgt_cli.files import discard_leftovers
 from vvgt_cli.progress import ProgressCallback
 from vvgt_cli.resources import memory_limit
@@ -155,7 +155,7 @@ def _need(name: str) -> Any:
     try:
         return importlib.import_module(name)
     except ImportError:
-        raise DataError(f"--scheduler: {name} is not installed; try: pip install 'vvgt[cluster]'") from None
+        raise DataError(f"--scheduler: {name} is not installed; try: {pip_install('cluster')}") from None
 
 
 class DaskRunner(Runner):

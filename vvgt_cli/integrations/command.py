@@ -22,7 +22,7 @@ def command() -> list[str]:
     words = [whole] if whole else shlex.split(given or "")
     if not words or shutil.which(words[0]) is None:
         what = f"VVGT={given}: no such program" if given else "vvgt: not in PATH"
-        raise RuntimeError(f"{what}; install it (pip install vvgt) or set VVGT to its path, as /opt/venv/bin/vvgt")
+        raise RuntimeError(f"{what}; install it, or set VVGT to its path, as /opt/venv/bin/vvgt")
     return words
 
 

@@ -6,7 +6,7 @@ four is time.
 
 Tried: napari 0.9.2
 Enable:
-    pip install vvgt beside napari: File > Save Selected Layers offers Gaussian splats (.html, .splats.ply, ...).
+    Install vvgt beside napari: File > Save Selected Layers offers Gaussian splats (.html, .splats.ply, ...).
 """
 
 from __future__ import annotations

@@ -385,10 +385,10 @@ def volume_in_memory(
 
 
 def dataset_volume(data: Any, options: ReadOptions, name: str) -> Volume:
-    """Call `vvgt_cli.volume.vtk.grids.dataset_volume`, which imports VTK."""
-    from vvgt_cli.volume.vtk import grids as vtk_grids
+    """Call `vvgt_cli.volume.vtk.leaves.dataset_volume`, which imports VTK."""
+    from vvgt_cli.volume.vtk import leaves as vtk_leaves
 
-    return vtk_grids.dataset_volume(data, options, name, name)
+    return vtk_leaves.dataset_volume(data, options, name, name)
 
 
 def _refuse(given: Sequence[str], why: str) -> None:

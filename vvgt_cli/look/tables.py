@@ -16,6 +16,7 @@ MAX_OPACITY = 1 - 1e-5  # conventions: every integral has a limit
 MIN_BINS, MAX_BINS = 2048, 65536
 BESIDE = 4.0  # times the nodes' range that is tabulated on each side: a segment that enters it there begins outside
 FLAT = 2.0  # optical depth of a voxel's edge by which extinction may differ where a segment is no finer sampled
+EVEN = 0.1  # the same where the scalar is far from linear along the segment
 BINS_PER_GAP = 8  # bins inside the narrowest gap between two nodes, where MAX_BINS allows
 
 
@@ -54,6 +55,7 @@ class Optics(NamedTuple):
         dark: (n + 1,) float64, the u up to which extinction is zero from bin i on: [u0, u1] is transparent if and only
             if u1 <= dark[floor(u0)].
         flat: (n + 1,) float64, the u up to which nodes differ by at most `FLAT` per voxel from bin i on.
+        even: the same for `EVEN`.
     """
 
     lo: float
@@ -62,6 +64,7 @@ class Optics(NamedTuple):
     cumulative: np.ndarray
     dark: np.ndarray
     flat: np.ndarray
+    even: np.ndarray
 
     @classmethod
     def of(cls, lo: float, inv_width: float, nodes: np.ndarray, cumulative: np.ndarray, voxel: float = 1.0) -> Optics:
@@ -69,7 +72,8 @@ class Optics(NamedTuple):
         count = len(nodes)
         positive = np.where(nodes[:, 3] > 0, np.arange(count), count + 1)
         dark = np.minimum.accumulate(positive[::-1])[::-1] - 1.0
-        return cls(lo, inv_width, nodes, cumulative, np.ascontiguousarray(dark), _flat_until(nodes, FLAT / voxel))
+        flat, even = (_flat_until(nodes, most / voxel) for most in (FLAT, EVEN))
+        return cls(lo, inv_width, nodes, cumulative, np.ascontiguousarray(dark), flat, even)
 
     @classmethod
     def linear(cls, top: float) -> Optics:

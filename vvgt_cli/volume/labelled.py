@@ -29,6 +29,10 @@ CF_ATTRIBUTES = (
     *("valid_min", "valid_max", "valid_range", "_Unsigned"),
 )
 DESCRIBES = ("bounds", "climatology", "cell_measures", "formula_terms", "ancillary_variables", "grid_mapping")
+FILLS = {  # of NetCDF, by type: what unwritten values have where no attribute says otherwise (netcdf.h, NC_FILL_)
+    "i2": -32767, "i4": -2147483647, "i8": -9223372036854775806, "u2": 65535, "u4": 4294967295,
+    "u8": 18446744073709551614, "f4": 9.969209968386869e36, "f8": 9.969209968386869e36,
+}  # fmt: skip
 GEOMETRY = (  # attributes that look like a place in space, in forms that no convention defines
     *("spacing", "voxel_size", "voxelSize", "pixel_size", "pixelSize", "resolution", "origin", "offset", "affine"),
     *("direction", "transform"),
@@ -385,11 +389,11 @@ def _placed(
             f"{source}: {steps_text}; expected evenly spaced values: try --dims X Y Z to resample to a regular grid, "
             "or --spacing X Y Z to take the values as evenly spaced"
         )
-    from vvgt_cli.volume.vtk.resample import rectilinear, resample
+    from vvgt_cli.volume.vtk.resample import resample
 
     points = [np.arange(a.size, dtype=float) if c is None else c for a, c in zip(axes, centres, strict=True)]
     data = (field * np.float64(scaling[0]) + scaling[1]).ravel()
-    return resample(rectilinear(points[::-1]), data, "point", options.dims, source, name)
+    return resample(points[::-1], data, options.dims, source, name)
 
 
 def _left(

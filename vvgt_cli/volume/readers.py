@@ -59,7 +59,7 @@ class Reader:
         holds: tells whether a folder holds the format.
         whole: a folder that holds it is one volume, whatever other files lie in it.
         within: formats that its files are recognised as; the file's name decides between them.
-        levels: path and options to the shapes of its resolutions, slowest axis first and finest first.
+        levels: files may have several resolutions, of which it takes the option ``level``.
         contents: path and options to lists of steps, arrays and blocks, for `vvgt info`.
     """
 
@@ -72,7 +72,7 @@ class Reader:
     holds: Callable[[Path], bool] | None = None
     whole: bool = False
     within: tuple[str, ...] = ()
-    levels: Callable[[Path, ReadOptions], list[tuple[int, ...]]] | None = None
+    levels: bool = False
     contents: Callable[[Path, ReadOptions], dict[str, Any]] | None = None
 
     @property

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import re
-import struct
-import zlib
+import warnings
+from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -17,6 +17,7 @@ from vvgt_cli.volume.blocks import read_head
 from vvgt_cli.volume.bodies import without_other_bodies
 from vvgt_cli.volume.components import listed
 from vvgt_cli.volume.headers import MARK
+from vvgt_cli.volume.libraries import library_errors
 from vvgt_cli.volume.medical import MASKS
 from vvgt_cli.volume.options import ReadOptions, crop, masked, parse_crop
 from vvgt_cli.volume.plain import RAW
@@ -28,6 +29,7 @@ from vvgt_cli.volume.types import Volume
 
 LOOKED_AT = 2000  # files of a folder
 LISTED = "NIfTI, NRRD, DICOM, TIFF, VTK, HDF5 or another format of docs/formats.md"
+MAX_LEVELS = 64  # resolutions of a file
 PREVIEWS = 10  # pictures for each volume beside them, up to which they do not make a folder one of slices
 
 
@@ -81,22 +83,19 @@ def _read(source: str, options: ReadOptions) -> Volume:
         return read_stdin(options)
     scheme, colon, rest = source.partition(":")
     if colon and scheme in SCHEMES:
-        return SCHEMES[scheme](rest, options)
+        with library_errors(source, "a volume"):
+            return SCHEMES[scheme](rest, options)
     path, options = _inner(source, options)
     if (kept := seekable(path)) != path:
         return _from_pipe(kept, path, source, options)
-    slices = _slices(source, options)
+    with library_errors(source, "slices"):
+        slices = _slices(source, options)
     if slices is not None:
         return slices
     reader = _folder(path, source) if os.path.isdir(path) else _find(path, _head(path, source), options)
     _check_options(reader, source, options)
-    try:
+    with library_errors(source, reader.name):
         return reader.read(path, options)
-    except (OSError, ValueError, struct.error, LookupError, ArithmeticError, EOFError, zlib.error) as error:
-        text = " ".join(str(error).split()) or type(error).__name__
-        raise DataError(f"{source}: damaged {reader.name} file ({text}); check that it is whole") from error
-    except MemoryError as error:
-        raise DataError(f"{source}: not enough memory to read it; try a machine with more") from error
 
 
 def _from_pipe(kept: Path, path: Path, source: str, options: ReadOptions) -> Volume:
@@ -129,17 +128,21 @@ def contents(source: str, options: ReadOptions) -> dict[str, Any]:
 
 
 def level_shapes(source: str, options: ReadOptions) -> list[tuple[int, ...]]:
-    """List shapes of a source's resolutions, slowest axis and finest first, or nothing; raise as `read_volume`."""
-    if source.partition(":")[0] in STEPPED:
-        from vvgt_cli.volume.arrays.remote import level_shapes as remote
-
-        return remote(source, options)
-    path = Path(source)
-    if path.is_dir():
-        reader = next((r for r in READERS if r.levels is not None and r.holds is not None and r.holds(path)), None)
-    else:
-        reader = _recognised(path, _head(path, source))[0] if path.is_file() else None
-    return [] if reader is None or reader.levels is None else reader.levels(path, options)
+    """List the shapes (z, y, x) of a source's resolutions, finest first; none where there are none, or none is read."""
+    path, shapes = Path(source), list[tuple[int, ...]]()
+    if source.partition(":")[0] not in STEPPED:
+        holding = (r for r in READERS if r.levels and r.holds is not None and r.holds(path))
+        reader = next(holding, None) if path.is_dir() else None
+        if path.is_file():
+            reader = _recognised(path, _head(path, source))[0]
+        if reader is None or not reader.levels:
+            return []
+    first = ReadOptions(array=options.array, component=0, time=options.time or 0, stored=True)
+    with suppress(VvgtError), warnings.catch_warnings():  # said where it is read
+        warnings.simplefilter("ignore")
+        while len(shapes) < MAX_LEVELS:
+            shapes.append(read_volume(source, replace(first, level=len(shapes))).data.shape)
+    return shapes
 
 
 def _inner(source: str, options: ReadOptions) -> tuple[Path, ReadOptions]:

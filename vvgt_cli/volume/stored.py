@@ -93,19 +93,6 @@ class Stored:
         return DataError(f"{self.source}: cannot be read ({error}); try again")
 
 
-def slice_by_slice(read: Callable[[int], np.ndarray], dtype: np.dtype, shape: tuple[int, ...], source: str) -> Stored:
-    """Return a `Stored` of which ``read`` returns slice z as (ny, nx)."""
-
-    def part(slices: Slices) -> np.ndarray:
-        z, y, x = slices
-        out = np.empty([s.stop - s.start for s in slices], dtype)
-        for k in range(z.start, z.stop):
-            out[k - z.start] = read(k)[y, x]
-        return out
-
-    return Stored(part, dtype, shape, (1, *shape[1:]), source)
-
-
 def stored_or_loaded(
     read: Callable[[Slices], np.ndarray], dtype: np.dtype, shape: Sequence[int], chunks: Sequence[int], source: str,
     stored: bool,

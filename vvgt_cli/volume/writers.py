@@ -26,6 +26,7 @@ from vvgt_cli.volume.space import in_space
 from vvgt_cli.volume.types import RIGHT, Volume
 
 SUFFIXES = (".nii.gz", ".nii", ".nrrd", ".mha", ".vti", ".npy", ".zarr", ".vdb")
+AT_ONCE = 128 << 20  # bytes
 _NAMES = {  # of types, in NRRD and in MetaImage
     "f4": ("float", "FLOAT"), "u1": ("uint8", "UCHAR"), "u2": ("uint16", "USHORT"), "i4": ("int32", "INT"),
 }  # fmt: skip
@@ -39,14 +40,14 @@ class Planes:
         grid: a volume whose place they have; its own values do not count.
         dtype: of the values: float32, uint8, uint16 or int32.
         components: numbers in a voxel.
-        make: makes slabs in order along z, (planes, ny, nx) or (planes, ny, nx, components).
+        make: makes the values of some planes, (planes, ny, nx) or (planes, ny, nx, components).
         background: value of most voxels.
     """
 
     grid: Volume
     dtype: np.dtype
     components: int
-    make: Callable[[], Iterator[np.ndarray]]
+    make: Callable[[range], np.ndarray]
     background: float = 0.0
 
     @property
@@ -56,7 +57,7 @@ class Planes:
 
     def slabs(self, component: int | None = None) -> Iterator[np.ndarray]:
         """Yield contiguous little-endian slabs, of all components or of one."""
-        for slab in self.make():
+        for slab in map(self.make, slabs(self.grid.dims)):
             part = slab if component is None or slab.ndim == 3 else slab[..., component]
             yield np.ascontiguousarray(part, self.dtype.newbyteorder("<"))
 
@@ -64,6 +65,14 @@ class Planes:
         """Return all values, (nz, ny, nx) or (nz, ny, nx, components); raise DataError if memory is too small."""
         check_memory(2 * self.nbytes, " x ".join(map(str, self.grid.dims)) + " voxels", "give fewer, by --dims")
         return np.concatenate(list(self.slabs()))
+
+
+def slabs(dims: tuple[int, int, int]) -> Iterator[range]:
+    """Yield the planes of a grid in slabs of which four numbers a voxel take `AT_ONCE` bytes, or one plane."""
+    nx, ny, nz = dims
+    deep = max(AT_ONCE // (16 * nx * ny), 1)
+    for z in range(0, nz, deep):
+        yield range(z, min(z + deep, nz))
 
 
 def write_volume(path: str | os.PathLike[str], planes: Planes, overwrite: bool = False) -> int:

@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from vvgt_cli.closed_form import METHODS
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.errors import DataError, UsageError, pip_install
 from vvgt_cli.network import NAMED, NetworkConfig
 
-INSTALL = "install vvgt[train]"
 SMALLEST_LPIPS = 16  # pixels: VGG-16 pools four times
 GROWTH = 1.3  # of Gaussians with the size of images
 
@@ -229,5 +228,5 @@ def _yaml() -> Any:
     try:
         import yaml
     except ImportError:
-        raise UsageError(f"training configurations need PyYAML; {INSTALL}") from None
+        raise UsageError(f"training configurations need PyYAML; try: {pip_install('train')}") from None
     return yaml

@@ -28,16 +28,16 @@ def is_zipped_zarr(head: bytes) -> bool:
 FORMATS = (
     Reader(
         "HDF5", (".h5", ".hdf5", ".he5", ".hdf", ".ims"), lazy("arrays.hdf5.read_hdf5"), is_hdf5, _ALL,
-        levels=lazy("microscopy.bigdataviewer.level_shapes"),
+        levels=True,
     ),
     Reader("NetCDF", (".nc", ".nc4", ".cdf"), lazy("arrays.netcdf.read_netcdf"), is_netcdf, _ALL, within=("HDF5",)),
     Reader(
         "Zarr", (".zarr",), lazy("arrays.zarr.read_zarr"), takes=_ALL, holds=lazy("arrays.zarr.holds_zarr"), whole=True,
-        levels=lazy("arrays.zarr.level_shapes"),
+        levels=True,
     ),
     Reader(
         "N5", (".n5",), lazy("arrays.n5.read_n5"), takes=_ALL, holds=lazy("arrays.n5.holds_n5"), whole=True,
-        levels=lazy("arrays.n5.level_shapes"),
+        levels=True,
     ),
     Reader("NumPy", (".npy",), lazy("arrays.npy.read_npy"), lambda head: head.startswith(b"\x93NUMPY"), ("time",)),
     Reader(

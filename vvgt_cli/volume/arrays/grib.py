@@ -12,7 +12,7 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.components import ArrayInfo, choose_array
 from vvgt_cli.volume.labelled import Axis, labelled_volume
-from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, library_errors, need, volume_name
+from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, need, volume_name
 
 GRIB = "GRIB"  # in the place of a program of `vtk_child`
 MISSING = -1e100
@@ -24,7 +24,7 @@ def grib_volume(path: Path, options: ReadOptions) -> Volume:
     """Read one variable at one time; levels are z, upwards, members of an ensemble are variables of their own."""
     codes, source = need("eccodes", "grib", str(path), "GRIB"), str(path)
     fields: dict[str, dict[tuple[Any, ...], dict[float, int]]] = {}  # variable, time, level, byte
-    with library_errors(source, "GRIB"), open(path, "rb") as file:
+    with open(path, "rb") as file:
         while (message := codes.codes_grib_new_from_file(file, headers_only=True)) is not None:
             names = [str(codes.codes_get(message, key)) for key in ("shortName", "typeOfLevel")]
             names += [str(codes.codes_get(message, "number"))] if codes.codes_is_defined(message, "number") else []

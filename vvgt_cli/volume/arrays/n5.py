@@ -27,7 +27,7 @@ from vvgt_cli.volume.arrays.zarr import inside, json_object, name_in
 from vvgt_cli.volume.labelled import Axis, labelled_volume
 from vvgt_cli.volume.microscopy import bigdataviewer
 from vvgt_cli.volume.microscopy.image import EXTRA
-from vvgt_cli.volume.reading import ReadOptions, Volume, library_errors, need
+from vvgt_cli.volume.reading import ReadOptions, Volume, need
 from vvgt_cli.volume.stored import put_overlap
 
 METADATA = "attributes.json"
@@ -146,23 +146,10 @@ def read_n5(path: Path, options: ReadOptions) -> Volume:
 
 def read_array(path: Path, options: ReadOptions) -> Volume:
     """Read one array of an N5 store, as it is."""
-    with library_errors(str(path), "N5"):
-        place = _choose(path, options)
-        array = _array(place)
-        dtype, name = array.dtype.newbyteorder("="), name_in(path, place)
-        return labelled_volume(array.read, dtype, _axes(array), {}, options, str(place), name, array.blocks)
-
-
-def level_shapes(path: Path, options: ReadOptions) -> list[tuple[int, ...]]:
-    """List the shapes of the levels of a pyramid, finest first; none where there is none."""
-    if not path.is_dir() or not holds_n5(path):
-        return []
-    try:
-        if shapes := bigdataviewer.level_shapes(path, options):
-            return shapes
-        return [_array(place).shape for place in _levels(inside(path, options.array))]
-    except (OSError, ValueError, TypeError, KeyError, DataError, UsageError):
-        return []  # said where it is read
+    place = _choose(path, options)
+    array = _array(place)
+    dtype, name = array.dtype.newbyteorder("="), name_in(path, place)
+    return labelled_volume(array.read, dtype, _axes(array), {}, options, str(place), name, array.blocks)
 
 
 def _levels(group: Path) -> list[Path]:

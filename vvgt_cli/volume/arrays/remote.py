@@ -11,21 +11,17 @@ import asyncio
 import weakref
 from dataclasses import replace
 from functools import cached_property
+from io import BytesIO
 from pathlib import Path, PurePosixPath
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 from zipfile import ZipFile, is_zipfile
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.arrays import MAX_CHUNK
 from vvgt_cli.volume.arrays.zarr import MAX_METADATA, holds_zarr, read_zarr
-from vvgt_cli.volume.arrays.zarr import level_shapes as zarr_levels
-from vvgt_cli.volume.reading import ReadOptions, Volume, library_errors, need
+from vvgt_cli.volume.reading import ReadOptions, Volume, need
 
 SCHEMES = ("http", "https")
-
-
-class _Size(NamedTuple):
-    st_size: int
 
 
 class _Server:
@@ -86,18 +82,6 @@ class Remote:
     def _at(self, inner: PurePosixPath) -> Remote:
         return Remote(self._server, self._root, str(inner), self._kept)
 
-    def __eq__(self, other: object) -> bool:
-        """Compare addresses."""
-        return str(self) == str(other)
-
-    def __hash__(self) -> int:
-        """Hash the address."""
-        return hash(str(self))
-
-    def __lt__(self, other: Remote) -> bool:
-        """Order by address."""
-        return str(self) < str(other)
-
     @property
     def name(self) -> str:
         """Return the last part of the address."""
@@ -141,17 +125,9 @@ class Remote:
         """Return False: a server has no links."""
         return False
 
-    def is_dir(self) -> bool:
-        """Return True: a server does not say what is a folder."""
-        return True
-
     def iterdir(self) -> list[Remote]:
         """List the places that the server lists below this one."""
         return [self / Path(entry["name"].rstrip("/")).name for entry in self._server.ours.ls(str(self))]
-
-    def stat(self) -> _Size:
-        """Return the size of the file here."""
-        return _Size(len(self._content or b""))
 
     def store(self) -> dict[str, Any]:
         """Return the arguments by which zarr opens the same place."""
@@ -162,9 +138,9 @@ class Remote:
         """Allow answers as long as a packed chunk of so many bytes."""
         self._server.most[0] = max(self._server.most[0], MAX_METADATA + size + size // 8)
 
-    def read_text(self, encoding: str) -> str:
-        """Read the file here as text; "" where there is none."""
-        return (self._content or b"").decode(encoding)
+    def open(self, mode: str) -> BytesIO:
+        """Open the file here to read bytes; empty where there is none."""
+        return BytesIO(self._content or b"")
 
 
 def _opened(url: str, options: ReadOptions) -> tuple[Path, ReadOptions]:
@@ -174,23 +150,17 @@ def _opened(url: str, options: ReadOptions) -> tuple[Path, ReadOptions]:
         head, inner = url, ""
     if inner and options.array is not None:
         raise UsageError(f"{url}: --array {options.array} and :/{inner} choose both; leave out one")
-    with library_errors(url, "Zarr"):
-        place = cast(Path, Remote(_Server(url), head.rstrip("/")))
-        if not holds_zarr(place):
-            raise DataError(
-                f"{url}: no Zarr there, or no answer (of another format download the file); expected .../x.ome.zarr"
-            )
+    place = cast(Path, Remote(_Server(url), head.rstrip("/")))
+    if not holds_zarr(place):
+        raise DataError(
+            f"{url}: no Zarr there, or no answer (of another format download the file); expected .../x.ome.zarr"
+        )
     return place, replace(options, array=inner or options.array)
 
 
 def read_scheme(scheme: str, rest: str, options: ReadOptions) -> Volume:
     """Read one array at the address ``scheme:rest``, chunk by chunk where the options leave it stored."""
     return read_zarr(*_opened(f"{scheme}:{rest}", options))
-
-
-def level_shapes(url: str, options: ReadOptions) -> list[tuple[int, ...]]:
-    """List the shapes of an OME-Zarr image's levels, finest first; errors are those of `read_scheme`."""
-    return zarr_levels(*_opened(url, options))
 
 
 class _Zipped(Remote):
@@ -226,7 +196,7 @@ def read_zipped(path: Path, options: ReadOptions) -> Volume:
     """Read one array of a zipped Zarr store, which may be a folder in the zip file."""
     if not is_zipfile(path):
         raise DataError(f"{path}: no zip file; expected a Zarr store in one")
-    with library_errors(str(path), "Zarr"), ZipFile(path) as file:
+    with ZipFile(path) as file:
         if any(entry.file_size > MAX_CHUNK for entry in file.infolist()):
             raise DataError(f"{path}: entries of more than 2 GiB; expected the chunks of a Zarr store")
         top = _Zipped(cast(Any, file), str(path))

@@ -23,7 +23,7 @@ from vvgt_cli.volume.arrays import MAX_CHUNK
 from vvgt_cli.volume.arrays.beside import Neighbour, choose_grid, with_neighbours
 from vvgt_cli.volume.labelled import Axis, axis, labelled_volume
 from vvgt_cli.volume.microscopy.image import hex_color
-from vvgt_cli.volume.reading import ReadOptions, Segment, Volume, library_errors, need, segments_in
+from vvgt_cli.volume.reading import ReadOptions, Segment, Volume, need, segments_in
 
 _CODECS = {
     *("blosc", "zstd", "gzip", "zlib", "lz4", "bz2", "lzma", "shuffle", "delta", "fixedscaleoffset", "quantize"),
@@ -42,23 +42,22 @@ def holds_zarr(path: Path) -> bool:
 def read_zarr(path: Path, options: ReadOptions) -> Volume:
     """Read one array of a Zarr store."""
     zarr = need("zarr", "zarr", str(path), "Zarr")
-    with library_errors(str(path), "Zarr"):
-        place, facts = _choose(path, options.array, options.level)
-        array = _array(zarr, place)
-        attributes = _marked(array)
-        names = facts.get("dimension_names") or attributes.get("_ARRAY_DIMENSIONS") or [""] * array.ndim
-        axes = _ome_axes(place, array.shape) or [
-            axis(str(name or ""), size) for name, size in zip(names, array.shape, strict=True)
-        ]
-        beside = _beside(zarr, path, place, [a.name for a in axes if a.centres is None])
-        axes = with_neighbours(axes, beside, str(place), options.spacing is not None)
-        volume = labelled_volume(
-            lambda index: np.asarray(array[index]), array.dtype, axes, attributes, options, str(place),
-            name_in(path, place), array.chunks,
-        )  # fmt: skip
-        if (labels := _ome(place.parent).get("image-label")) is None:
-            return volume
-        return replace(volume, segments=segments_in(lambda: _segments(labels), str(place)))
+    place, facts = _choose(path, options.array, options.level)
+    array = _array(zarr, place)
+    attributes = _marked(array)
+    names = facts.get("dimension_names") or attributes.get("_ARRAY_DIMENSIONS") or [""] * array.ndim
+    axes = _ome_axes(place, array.shape) or [
+        axis(str(name or ""), size) for name, size in zip(names, array.shape, strict=True)
+    ]
+    beside = _beside(zarr, path, place, [a.name for a in axes if a.centres is None])
+    axes = with_neighbours(axes, beside, str(place), options.spacing is not None)
+    volume = labelled_volume(
+        lambda index: np.asarray(array[index]), array.dtype, axes, attributes, options, str(place),
+        name_in(path, place), array.chunks,
+    )  # fmt: skip
+    if (labels := _ome(place.parent).get("image-label")) is None:
+        return volume
+    return replace(volume, segments=segments_in(lambda: _segments(labels), str(place)))
 
 
 def _segments(labels: dict[str, Any]) -> list[Segment]:
@@ -121,9 +120,11 @@ def inside(path: Path, wanted: str | None) -> Path:
 
 def json_object(file: Path) -> dict[str, Any]:
     """Read a file of metadata; raise DataError for more than `MAX_METADATA` bytes, or no JSON object."""
-    if file.stat().st_size > MAX_METADATA:
-        raise DataError(f"{file}: {file.stat().st_size} bytes; expected metadata of at most 16 MiB")
-    content = json.loads(file.read_text("utf-8"))
+    with file.open("rb") as stream:
+        text = stream.read(MAX_METADATA + 1)
+    if len(text) > MAX_METADATA:
+        raise DataError(f"{file}: more than 16 MiB; expected metadata of at most that")
+    content = json.loads(text)
     if not isinstance(content, dict):
         raise DataError(f"{file}: expected a JSON object of metadata")
     return content
@@ -141,22 +142,14 @@ def _metadata(folder: Path) -> dict[str, Any]:
     return {}
 
 
-def level_shapes(path: Path, options: ReadOptions) -> list[tuple[int, ...]]:
-    """List the shapes of the levels of an OME-Zarr image, finest first; none where a store is no such image."""
-    here = path / (options.array or "").strip("/")
-    if not here.is_dir() or not holds_zarr(here) or not here.resolve().is_relative_to(path.resolve()):
-        return []
-    places = [here / str(entry.get("path")) for entry in _multiscale(here).get("datasets", [])]
-    inside = [place for place in places if place.resolve().is_relative_to(path.resolve())]
-    return [tuple(_metadata(place).get("shape", ())) for place in inside]
-
-
 def _choose(path: Path, wanted: str | None, number: int | None) -> tuple[Path, dict[str, Any]]:
     """Return folder and metadata of the array asked for, else of the image's level ``number``, else of the only one."""
     here = inside(path, wanted)
     facts = _metadata(here)
     if facts.get("node_type") == "array":
         choose_grid({here.name: (facts["shape"], _type(facts))}, here.name, str(path))
+        if number is not None:
+            raise UsageError(f"{path}: an array without levels; leave out --level {number}")
         return here, facts
     level = _multiscale(here)
     if number is not None and not level:
@@ -183,7 +176,7 @@ def _arrays(root: Path) -> list[tuple[Path, dict[str, Any]]]:
     arrays: list[tuple[Path, dict[str, Any]]] = []
     groups = [root]
     while groups:
-        for folder in sorted(p for p in groups.pop(0).iterdir() if p.is_dir() and not p.is_symlink()):
+        for folder in sorted((p for p in groups.pop(0).iterdir() if not p.is_symlink()), key=str):
             facts = _metadata(folder)
             if facts.get("node_type") == "array" and facts.get("shape"):
                 arrays.append((folder, facts))
@@ -214,10 +207,7 @@ def _check_codecs(place: Path, facts: dict[str, Any]) -> None:
 def _attributes(folder: Path) -> dict[str, Any]:
     """Read the attributes of a node of either version."""
     old = folder / ".zattrs"
-    if old.is_file() and old.stat().st_size <= MAX_METADATA:
-        attributes = json.loads(old.read_text("utf-8"))
-    else:
-        attributes = _metadata(folder).get("attributes")
+    attributes = json_object(old) if old.is_file() else _metadata(folder).get("attributes")
     return attributes if isinstance(attributes, dict) else {}
 
 
@@ -231,10 +221,10 @@ def _beside(zarr: Any, path: Path, place: Path, names: Sequence[str]) -> dict[st
     group = place.parent
     folders = [group / name for name in names if name and "/" not in name and name not in (".", "..")]
     with suppress(OSError, NotImplementedError):
-        folders += [f for f in group.iterdir() if f.is_dir() and not f.is_symlink()] if place != path else []
+        folders += [f for f in group.iterdir() if not f.is_symlink()] if str(place) != str(path) else []
     neighbours = {}
     for folder in folders:
-        facts = _metadata(folder) if folder != place else {}
+        facts = _metadata(folder) if str(folder) != str(place) else {}
         if facts.get("node_type") == "array":
             neighbours[folder.name] = Neighbour.of(facts.get("shape", ()), partial(line, folder))
     return neighbours

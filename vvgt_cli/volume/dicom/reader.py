@@ -21,7 +21,7 @@ from vvgt_cli.volume.dicom.pet import in_suv
 from vvgt_cli.volume.dicom.segmentation import is_segmentation, names_of, read_segmentation
 from vvgt_cli.volume.dicom.series import Files, Source, choose_series, headers_in, one_stack, read_file
 from vvgt_cli.volume.dicom.volumes import ATTRIBUTES, one_volume
-from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, library_errors, need, printable, select_component
+from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, need, printable, select_component
 
 HOUNSFIELD = "HU"  # Rescale Type (0028,1054), and what CT's is where it is absent (PS3.3, C.8.2.1.1.5)
 ANGLE = 1e-3  # of a unit normal: how far slices may be tilted against each other
@@ -84,20 +84,19 @@ def read_dicom(path: Path, options: ReadOptions) -> Volume:
             volumes (`SeveralSteps`).
     """
     need("pydicom", "dicom", str(path), "DICOM")
-    with library_errors(str(path), "DICOM"):
-        title, chosen, rest = choose_series(headers_in(path), options.array, path)
-        if is_segmentation(chosen[0][1]):
-            return _segmentation(path, chosen, options)
-        number, _, name = rest.partition("/")
-        name, stack = (name, int(number)) if number.isdecimal() else (rest, None)
-        mosaic = next((_mosaic(file) for file, header in chosen if _is_mosaic(header)), None)
-        slices = [s for file, header in chosen for s in _frames(file, header, mosaic, options)]
-        slices = one_volume(one_stack(slices, _alike, stack, title, path), options, name, path)
-        slices, unit = in_suv(slices, [header for _, header in chosen], options.suv, path)
-        normal = np.cross(*slices[0].rows)
-        slices.sort(key=lambda s: float(s.position @ normal))
-        spacing, direction, heights = _geometry(slices, path, options)
-        values, (slope, intercept) = _pixels(slices, path)
+    title, chosen, rest = choose_series(headers_in(path), options.array, path)
+    if is_segmentation(chosen[0][1]):
+        return _segmentation(path, chosen, options)
+    number, _, name = rest.partition("/")
+    name, stack = (name, int(number)) if number.isdecimal() else (rest, None)
+    mosaic = next((_mosaic(file) for file, header in chosen if _is_mosaic(header)), None)
+    slices = [s for file, header in chosen for s in _frames(file, header, mosaic, options)]
+    slices = one_volume(one_stack(slices, _alike, stack, title, path), options, name, path)
+    slices, unit = in_suv(slices, [header for _, header in chosen], options.suv, path)
+    normal = np.cross(*slices[0].rows)
+    slices.sort(key=lambda s: float(s.position @ normal))
+    spacing, direction, heights = _geometry(slices, path, options)
+    values, (slope, intercept) = _pixels(slices, path)
     values, (slope, intercept) = select_component(
         values, options.component, str(path), label="each pixel", scaling=(slope, intercept)
     )
@@ -114,11 +113,11 @@ def read_dicom(path: Path, options: ReadOptions) -> Volume:
 
 def _resampled(volume: Volume, heights: np.ndarray, options: ReadOptions, path: Path) -> Volume:
     """Return a volume of slices at ``heights`` (n,) above the first, sampled on the grid asked for."""
-    from vvgt_cli.volume.vtk.resample import rectilinear, resample
+    from vvgt_cli.volume.vtk.resample import resample
 
     x, y = (step * np.arange(n) for step, n in zip(volume.spacing, volume.dims[:2], strict=False))
     values = volume.data * np.float64(volume.slope) + volume.intercept
-    sampled = resample(rectilinear([x, y, heights]), values.ravel(), "point", options.dims, str(path), volume.name)
+    sampled = resample([x, y, heights], values.ravel(), options.dims, str(path), volume.name)
     origin = tuple((np.array(volume.origin) + volume.axes @ np.array(sampled.origin)).tolist())
     place: dict[str, Any] = {"spacing": sampled.spacing, "origin": origin, "slope": 1.0, "intercept": 0.0}
     return replace(volume, data=sampled.data, name=sampled.name, **place)

@@ -105,28 +105,27 @@ def read_segmentation(path: Path, options: ReadOptions) -> Volume:
     """
     source = str(path)
     highdicom = need("highdicom", EXTRA, source, WHAT)
-    with library_errors(source, WHAT):
-        read = highdicom.seg.segread(path)
-        if read.segmentation_type == highdicom.seg.SegmentationTypeValues.FRACTIONAL:
-            raise DataError(
-                f"{source}: {WHAT} of fractions; expected one of bits or of labels: export it as BINARY or LABELMAP"
-            )
-        grid = read.get_volume_geometry()
-        if grid is None:
-            raise DataError(f"{source}: planes that are no even stack; expected a segmentation of a volume")
-        numbers = sorted(number for number in read.segment_numbers if number)
-        check_memory(2 * math.prod(grid.spatial_shape), source)
-        chosen = _chosen(numbers, options.component, source)
-        try:
-            combined = read.get_volume(segment_numbers=chosen, combine_segments=True)
-        except RuntimeError as error:
-            if "overlap" not in str(error):
-                raise
-            raise SeveralComponents(
-                f"{source}: {len(numbers)} segments that overlap; expected one: choose it with --component 0 to "
-                f"{len(numbers) - 1}",
-                len(numbers),
-            ) from None
+    read = highdicom.seg.segread(path)
+    if read.segmentation_type == highdicom.seg.SegmentationTypeValues.FRACTIONAL:
+        raise DataError(
+            f"{source}: {WHAT} of fractions; expected one of bits or of labels: export it as BINARY or LABELMAP"
+        )
+    grid = read.get_volume_geometry()
+    if grid is None:
+        raise DataError(f"{source}: planes that are no even stack; expected a segmentation of a volume")
+    numbers = sorted(number for number in read.segment_numbers if number)
+    check_memory(2 * math.prod(grid.spatial_shape), source)
+    chosen = _chosen(numbers, options.component, source)
+    try:
+        combined = read.get_volume(segment_numbers=chosen, combine_segments=True)
+    except RuntimeError as error:
+        if "overlap" not in str(error):
+            raise
+        raise SeveralComponents(
+            f"{source}: {len(numbers)} segments that overlap; expected one: choose it with --component 0 to "
+            f"{len(numbers) - 1}",
+            len(numbers),
+        ) from None
     steps = combined.affine[:3, 2::-1]  # of column, row and slice
     spacing = np.linalg.norm(steps, axis=0)
     own = segments_in(lambda: [one for one in segments(source) if one.number in chosen], source)

@@ -17,7 +17,7 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.arrays.hdf5 import checked_dataset
 from vvgt_cli.volume.arrays.netcdf import check_header
-from vvgt_cli.volume.libraries import library_errors, need, read_part
+from vvgt_cli.volume.libraries import need, read_part
 from vvgt_cli.volume.readers import HDF5, volume_name
 from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, magnitude, placed, select_component, text_of
 from vvgt_cli.volume.stored import Slices, give_back, stored_or_loaded
@@ -54,9 +54,8 @@ def read_minc(path: Path, options: ReadOptions) -> Volume:
     """Read a MINC file as float32. An axis that is neither of space nor named ``time`` is of components."""
     with open(path, "rb") as file:
         packed = file.read(len(HDF5)) == HDF5
-    with library_errors(str(path), "MINC"):
-        image = _minc2(path) if packed else _minc1(path)
-        return _volume(image, path, options)
+    image = _minc2(path) if packed else _minc1(path)
+    return _volume(image, path, options)
 
 
 def _minc1(path: Path) -> _Image:

@@ -15,7 +15,7 @@ FORMATS = (
     Reader("ND2", (".nd2",), lazy("microscopy.nikon.read_nd2"), lambda head: head.startswith(ND2_MAGIC), _TAKES),
     Reader(
         "BigDataViewer", (), lazy("microscopy.bigdataviewer.read_bdv"), lambda head: b"<SpimData" in head, _TAKES,
-        levels=lazy("microscopy.bigdataviewer.level_shapes"),
+        levels=True,
     ),
     Reader("CZI", (".czi",), lazy("microscopy.zeiss.read_czi"), lambda head: head.startswith(b"ZISRAWFILE"), _TAKES),
 )  # fmt: skip

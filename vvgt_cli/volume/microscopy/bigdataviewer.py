@@ -9,7 +9,6 @@ import itertools
 import re
 import warnings
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -17,8 +16,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, UsageError, VvgtError
-from vvgt_cli.volume.microscopy import imaris
+from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.microscopy.image import MAX_XML, choose_channel, choose_image, safe_xml
 from vvgt_cli.volume.readers import lazy
 from vvgt_cli.volume.reading import ReadOptions, Volume, magnitude, need, printable
@@ -31,7 +29,7 @@ READ = {  # by the XML element that names the data: reader, and the array of tim
     "zarr": (lazy("arrays.zarr.read_zarr"), "s{s}-t{t}.zarr/{l}"),
 }
 VIEW = re.compile(r"/?(?:t(?P<t>\d+)/s(?P<s>\d+)/(?P<l>\d+)/cells|setup(?P<s5>\d+)/timepoint(?P<t5>\d+)/s(?P<l5>\d+))")
-MAX_TIMES, MAX_LEVELS = 1_000_000, 64
+MAX_TIMES = 1_000_000
 ALIKE = 1e-3  # relative difference up to which a registration has the proportions of the voxel sizes
 
 
@@ -85,14 +83,6 @@ class _Dataset:
             ) from error
         return volume
 
-    def levels(self, view: tuple[int, int]) -> list[tuple[int, ...]]:
-        """List the shapes (z, y, x) of the levels of a view."""
-        shapes: list[tuple[int, ...]] = []
-        with suppress(VvgtError):
-            while len(shapes) < MAX_LEVELS:
-                shapes.append(self.read(view, len(shapes)).data.shape)
-        return shapes
-
 
 def read_bdv(path: Path, options: ReadOptions) -> Volume:
     """Read a channel of a time step at ``options.level``; ``options.array`` chooses among tiles, angles and so on."""
@@ -103,17 +93,6 @@ def read_beside(path: Path, options: ReadOptions) -> Volume | None:
     """Read an HDF5 file or N5 folder by the XML file beside it; return None where BigDataViewer did not lay it out."""
     bdv = _of_data(path, options.spacing is None)
     return None if bdv is None else _read(bdv, options)
-
-
-def level_shapes(path: Path, options: ReadOptions) -> list[tuple[int, ...]]:
-    """List the shapes (z, y, x) of the levels, finest first, of Imaris too; none for other or faulty files."""
-    if shapes := imaris.level_shapes(path, options):
-        return shapes
-    try:
-        bdv = _described(path) if _is_xml(path) else _of_data(path, False)
-        return [] if bdv is None else bdv.levels(bdv.present(bdv.times[0], bdv.setups[0]))
-    except (VvgtError, OSError):
-        return []  # said where it is read
 
 
 def _is_xml(path: Path) -> bool:
@@ -182,9 +161,11 @@ def _read(bdv: _Dataset, options: ReadOptions) -> Volume:
 def _view(bdv: _Dataset, time: int, setup: _Setup, options: ReadOptions) -> Volume:
     """Read a view, left in its file, at the place that its registration gives it."""
     view, level = bdv.present(time, setup), options.level or 0
-    if level and level >= (count := len(bdv.levels(view))):
-        raise UsageError(f"{bdv.source}: --level {level}: expected full, or 0 to {count - 1}")
-    finest, volume = bdv.read(view, 0), bdv.read(view, level)
+    finest = bdv.read(view, 0)
+    try:
+        volume = bdv.read(view, level) if level else finest
+    except DataError as error:
+        raise UsageError(f"{bdv.source}: --level {level}: no such level; expected full, or a lower one") from error
     if len(setup.size) and [*finest.dims] != [*setup.size]:
         dims, stated = (" x ".join(f"{n:g}" for n in some) for some in (finest.dims, setup.size))
         raise DataError(

@@ -25,19 +25,6 @@ def is_imaris(file: Any) -> bool:
     return "DataSet/ResolutionLevel 0/TimePoint 0/Channel 0/Data" in file and "DataSetInfo" in file
 
 
-def level_shapes(path: Path, options: ReadOptions) -> list[tuple[int, ...]]:
-    """List the shapes (z, y, x) of the levels, finest first; none for another file, or without h5py."""
-    try:
-        import h5py
-    except ImportError:
-        return []
-    try:
-        with h5py.File(path, "r") as file:
-            return [_shape(file, level) for level in range(_count(file, "ResolutionLevel"))] if is_imaris(file) else []
-    except (OSError, ValueError, KeyError, RuntimeError, DataError):
-        return []  # said where it is read
-
-
 def read_imaris(file: Any, path: Path, options: ReadOptions, checked: Callable[[str], Any]) -> Volume:
     """Read a channel of a time step of an open file at ``options.level``.
 

@@ -14,7 +14,7 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import check_memory, count, load_block
 from vvgt_cli.volume.microscopy.image import EXTRA, Bounded, Color, Micrograph, choose_image, picture_volume, safe_xml
-from vvgt_cli.volume.reading import ReadOptions, Slices, Volume, library_errors, need, volume_name
+from vvgt_cli.volume.reading import ReadOptions, Slices, Volume, need, volume_name
 from vvgt_cli.volume.space import MICROMETRE, metres
 
 LUTS: dict[str, Color] = {
@@ -27,7 +27,7 @@ def read_lif(path: Path, options: ReadOptions) -> Volume:
     """Read one image of a LIF file; spacing in micrometres."""
     liffile = need("liffile", EXTRA, str(path), "LIF")
     _check_header(path)
-    with library_errors(str(path), "LIF"), Bounded(path) as stream, liffile.LifFile(stream, squeeze=False) as file:
+    with Bounded(path) as stream, liffile.LifFile(stream, squeeze=False) as file:
         images = list(file.images)
         facts = [_facts(i) for i in images]
         deep = [" Z" in text for text in facts]

@@ -26,7 +26,7 @@ def read_nd2(path: Path, options: ReadOptions) -> Volume:
     """Read one position of an ND2 file; spacing in micrometres."""
     nd2 = need("nd2", EXTRA, str(path), "ND2")
     there = _frames(path)
-    with library_errors(str(path), "ND2"), Bounded(path) as stream, nd2.ND2File(stream) as file:
+    with Bounded(path) as stream, nd2.ND2File(stream) as file:
         sizes = {str(a): int(n) for a, n in file.sizes.items()}
         odd = [a for a, n in sizes.items() if a not in "TPZCYXS" and n > 1]
         if odd or min(sizes.values(), default=0) < 1 or not {"Y", "X"} <= set(sizes):

@@ -33,7 +33,7 @@ from vvgt_cli.volume.microscopy.image import (
     picture_volume,
     safe_xml,
 )
-from vvgt_cli.volume.reading import ReadOptions, Slices, Volume, library_errors, need, volume_name
+from vvgt_cli.volume.reading import ReadOptions, Slices, Volume, need, volume_name
 from vvgt_cli.volume.space import MICROMETRE
 
 SEGMENT = struct.Struct("<16sqq")  # name, bytes set aside, bytes used
@@ -191,34 +191,33 @@ TILE = 512  # pixels along the edge of what is read together, at least
 
 def read_czi(path: Path, options: ReadOptions) -> Volume:
     """Read one scene of a CZI file; spacing in micrometres."""
-    with library_errors(str(path), "CZI"):
-        every, xml = tiles_of(path)
-        scene, tiles = _scene(every, options, path)
-        at = {a: [t.at.get(a, 0) for t in tiles] for a in {a for t in tiles for a in t.at}}
-        ends = {a: (min(some), max(some)) for a, some in at.items()}
-        odd = [a for a, (lo, hi) in ends.items() if a not in "TCZMS" and hi > lo]
-        kinds = {tile.pixel for tile in tiles}
-        if odd or len(kinds) != 1 or not kinds <= set(PIXELS):
-            raise DataError(
-                f"{path}: axes {', '.join(sorted(ends))} (several along {', '.join(odd) or 'none'}), "
-                f"pixels of types {sorted(kinds)}; expected several of T, C and Z at most, and one of {sorted(PIXELS)}"
-            )
-        dtype, samples = PIXELS[kinds.pop()]
-        x, y, width, height = _bounds(tiles)
-        times, channels, slices = (ends[a][1] - ends[a][0] + 1 if a in ends else 1 for a in "TCZ")
-        filled = sum(t.width * t.height for t in tiles)
-        if times * channels * slices * width * height > SPARSE * filled:
-            raise DataError(f"{path}: tiles of {filled} pixels far apart; check that the CZI file is whole")
-        spacing, names, colors = _metadata(xml, channels, path)
-        first = {a: ends[a][0] for a in "TCZ" if a in ends}
-        read = partial(_read, path, _by_plane(tiles, first), (x, y), samples, np.dtype(dtype))
-        chunk = max(TILE, max(t.height for t in tiles)), max(TILE, max(t.width for t in tiles))
-        picture = Micrograph(
-            times, channels * samples, (slices, height, width), np.dtype(dtype), read, (1, *chunk), spacing,
-            names=names if samples == 1 else (), colors=colors, rgb=samples > 1 and channels == 1,
-        )  # fmt: skip
-        name = volume_name(path) + ("" if scene is None else f":{scene}")
-        return picture_volume(picture, options, str(path), name)
+    every, xml = tiles_of(path)
+    scene, tiles = _scene(every, options, path)
+    at = {a: [t.at.get(a, 0) for t in tiles] for a in {a for t in tiles for a in t.at}}
+    ends = {a: (min(some), max(some)) for a, some in at.items()}
+    odd = [a for a, (lo, hi) in ends.items() if a not in "TCZMS" and hi > lo]
+    kinds = {tile.pixel for tile in tiles}
+    if odd or len(kinds) != 1 or not kinds <= set(PIXELS):
+        raise DataError(
+            f"{path}: axes {', '.join(sorted(ends))} (several along {', '.join(odd) or 'none'}), "
+            f"pixels of types {sorted(kinds)}; expected several of T, C and Z at most, and one of {sorted(PIXELS)}"
+        )
+    dtype, samples = PIXELS[kinds.pop()]
+    x, y, width, height = _bounds(tiles)
+    times, channels, slices = (ends[a][1] - ends[a][0] + 1 if a in ends else 1 for a in "TCZ")
+    filled = sum(t.width * t.height for t in tiles)
+    if times * channels * slices * width * height > SPARSE * filled:
+        raise DataError(f"{path}: tiles of {filled} pixels far apart; check that the CZI file is whole")
+    spacing, names, colors = _metadata(xml, channels, path)
+    first = {a: ends[a][0] for a in "TCZ" if a in ends}
+    read = partial(_read, path, _by_plane(tiles, first), (x, y), samples, np.dtype(dtype))
+    chunk = max(TILE, max(t.height for t in tiles)), max(TILE, max(t.width for t in tiles))
+    picture = Micrograph(
+        times, channels * samples, (slices, height, width), np.dtype(dtype), read, (1, *chunk), spacing,
+        names=names if samples == 1 else (), colors=colors, rgb=samples > 1 and channels == 1,
+    )  # fmt: skip
+    name = volume_name(path) + ("" if scene is None else f":{scene}")
+    return picture_volume(picture, options, str(path), name)
 
 
 def _scene(tiles: list[CziTile], options: ReadOptions, path: Path) -> tuple[int | None, list[CziTile]]:

@@ -2,9 +2,8 @@
 
 Read here because no wheel of OpenVDB exists; its own Python module, where a system has it, reads fewer types.
 
-A tree's active bounding box becomes a `BrickArray`, a (nz, ny, nx) array kept as those 8^3 bricks that vary (leaves, as
-they are), beside one value for every other brick (tiles). It stands where a `Volume` has its array. Slabs of z are put
-together when they are asked for; whoever needs the whole array gets it laid out once, in memory that takes no page
+A tree's active bounding box is kept as those 8^3 bricks that vary (leaves, as they are), beside one value for every
+other brick (tiles). Its slabs are put together when they are asked for, or all of it once, in memory that takes no page
 where all is zero.
 """
 
@@ -13,6 +12,7 @@ from __future__ import annotations
 import math
 import mmap
 import warnings
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +23,11 @@ from vvgt_cli.volume.components import choose, listed, select_component
 from vvgt_cli.volume.openvdb.archive import TYPES, Grid, read_grid_head, read_header
 from vvgt_cli.volume.openvdb.codec import Cursor
 from vvgt_cli.volume.openvdb.tree import Node, Tree, TreeReader
-from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, placed, printable, volume_name
+from vvgt_cli.volume.reading import ReadOptions, Slices, Stored, Volume, check_memory, placed, printable, volume_name
 
 LOOKS = dict.fromkeys(("density", "smoke"), "smoke") | dict.fromkeys(("flame", "flames", "temperature", "heat"), "fire")
+EDGE = 8  # voxels along a brick
+MAX_VOXELS = 1 << 36  # 4096^3: the box alone, not what is in it, decides how long a walk through it takes
 
 
 def choose_grid(grids: list[Grid], wanted: str | None, source: str) -> Grid:
@@ -86,7 +88,9 @@ def read_vdb(path: Path, options: ReadOptions) -> Volume:
     transform = read_grid_head(cursor)[2]
     tree = read_tree(cursor, grids, grid)
     lo, hi = bounding_box(tree, f"{path}: grid {grid}")
-    values = brick_array(tree, lo, hi, options.component, str(path), f"grid {grid.label!r}")
+    values: Any = brick_array(tree, lo, hi, options.component, str(path), f"grid {grid.label!r}")
+    if not (options.stored or options.packed):
+        values = laid_out(values)
     origin = lo @ transform[:3] + transform[3]
     facts = {"quantity": printable(grid.name), "preset": LOOKS.get(grid.name, "")}
     return placed(values, transform[:3], origin, options, volume_name(path), **facts)
@@ -123,8 +127,8 @@ def bounding_box(tree: Tree, name: str) -> tuple[np.ndarray, np.ndarray]:
 
 def brick_array(
     tree: Tree, lo: np.ndarray, hi: np.ndarray, component: int | str | None, source: str, label: str
-) -> BrickArray:
-    """Lay out the voxels ``lo`` to ``hi`` (3,) (x, y, z), both included; of vectors one component.
+) -> Stored:
+    """Wrap the voxels ``lo`` to ``hi`` (3,) (x, y, z), both included; of vectors one component.
 
     Raises:
         DataError: more than the free memory, or a box that is too large.
@@ -148,8 +152,49 @@ def brick_array(
     fill = _choose(fill, component, source, label)
     cubes = bricks.reshape(-1, EDGE, EDGE, *bricks.shape[4:])
     bricks = _choose(cubes, component, source, label).reshape(-1, EDGE, EDGE, EDGE)
-    z, y, x = (int(v) for v in (lo - first * EDGE)[::-1])
-    return BrickArray(fill, which, bricks, (z, y, x), [int(b - a) + 1 for a, b in zip(lo[::-1], hi[::-1], strict=True)])
+    z0, y0, x0 = (int(v) for v in (lo - first * EDGE)[::-1])
+
+    @lru_cache(maxsize=1)  # as slabs are thinner than bricks
+    def layer(at: int) -> np.ndarray:
+        """Return the values (8, 8 by, 8 bx) of one layer of bricks."""
+        by, bx = which.shape[1:]
+        out = np.empty((EDGE, by, EDGE, bx, EDGE), fill.dtype)
+        out[:] = fill[at][None, :, None, :, None]
+        j, i = np.nonzero(which[at] >= 0)
+        # bricks are (n, x, y, z); indices apart put n first: (n, z, y, x)
+        out[:, j, :, i, :] = bricks[which[at, j, i]].transpose(0, 3, 2, 1)
+        return out.reshape(EDGE, by * EDGE, bx * EDGE)
+
+    def read(slices: Slices) -> np.ndarray:
+        z, y, x = slices
+        out = np.empty([max(s.stop - s.start, 0) for s in slices], fill.dtype)
+        k = z.start
+        while k < z.stop:
+            at, inside = divmod(k + z0, EDGE)
+            n = min(EDGE - inside, z.stop - k)
+            box = layer(at)[inside : inside + n, y0 + y.start : y0 + y.stop, x0 + x.start : x0 + x.stop]
+            out[k - z.start : k - z.start + n] = box
+            k += n
+        return out
+
+    shape = tuple(int(b - a) + 1 for a, b in zip(lo[::-1], hi[::-1], strict=True))
+    return Stored(read, fill.dtype, shape, (EDGE, *shape[1:]), source)
+
+
+def laid_out(values: Stored) -> np.ndarray:
+    """Return the values in memory, read-only; pages are taken only where something differs from zero.
+
+    Raises:
+        DataError: more than the free memory.
+    """
+    check_memory(values.nbytes, f"{' x '.join(map(str, reversed(values.shape)))} voxels laid out")
+    out = _blank(values.shape, values.dtype)
+    for z in range(0, len(values), EDGE):
+        slab = values[z : z + EDGE]
+        rows = slab.view(np.uint8).any(axis=2)  # bytes, not values: minus zero is something
+        out[z : z + EDGE][rows] = slab[rows]
+    out.flags.writeable = False
+    return out
 
 
 def _choose(values: np.ndarray, component: int | str | None, source: str, label: str) -> np.ndarray:
@@ -180,111 +225,6 @@ def _paint(fill: np.ndarray, node: Node, first: np.ndarray, background: np.ndarr
         x0, y0, z0 = np.maximum(at, 0).tolist()
         x1, y1, z1 = np.minimum(at + width, size).tolist()
         fill[z0:z1, y0:y1, x0:x1] = values[tuple(entry)]
-
-
-EDGE = 8  # voxels along a brick
-MAX_VOXELS = 1 << 36  # 4096^3: the box alone, not what is in it, decides how long a walk through it takes
-
-
-class BrickArray:
-    """An array of bricks; attributes that are not listed below are those of the whole array, laid out for them.
-
-    Attributes:
-        shape: (nz, ny, nx).
-        dtype: of the values.
-    """
-
-    ndim = 3
-
-    def __init__(
-        self, fill: np.ndarray, which: np.ndarray, bricks: np.ndarray, first: tuple[int, int, int], shape: Any
-    ) -> None:
-        """Take ``bricks`` (n, 8, 8, 8) by x, y, z, and their rows ``which`` (bz, by, bx) int32, -1 where there is none.
-
-        ``fill`` (bz, by, bx) holds the values of those; ``first`` voxels (z, y, x) of the first bricks lie before the
-        array.
-        """
-        self.shape: tuple[int, int, int] = tuple(shape)
-        self.dtype = fill.dtype
-        self.size = math.prod(self.shape)
-        self.nbytes = self.size * self.dtype.itemsize
-        self._fill, self._which, self._bricks, self._first = fill, which, bricks, first
-        self._layer: tuple[int, np.ndarray] | None = None
-        self._whole: np.ndarray | None = None
-
-    def __len__(self) -> int:
-        """Return the number of slices."""
-        return self.shape[0]
-
-    def __getitem__(self, key: Any) -> np.ndarray:
-        """Return a slice, a range of slices, or any other part of the array laid out."""
-        if isinstance(key, int | np.integer):
-            z = int(key) + (len(self) if key < 0 else 0)
-            if not 0 <= z < len(self):
-                raise IndexError(f"slice {key} of {len(self)}")
-            result: np.ndarray = self._slices(z, z + 1)[0]
-            return result
-        if isinstance(key, slice) and key.step in (None, 1):
-            start, stop, _ = key.indices(len(self))
-            return self._slices(start, max(start, stop))
-        picked: np.ndarray = self.whole()[key]
-        return picked
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        """Return the array laid out."""
-        return np.array(self.whole(), dtype, copy=copy) if copy else np.asarray(self.whole(), dtype)
-
-    def __getattr__(self, name: str) -> Any:
-        """Return an attribute of the array laid out."""
-        if name.startswith("_"):  # protocols that numpy and copy ask for
-            raise AttributeError(name)
-        return getattr(self.whole(), name)
-
-    def whole(self) -> np.ndarray:
-        """Return the array in memory, C-contiguous; pages are taken only where something differs from zero.
-
-        Raises:
-            DataError: more than the free memory.
-        """
-        if self._whole is None:
-            check_memory(self.nbytes, f"{' x '.join(map(str, reversed(self.shape)))} voxels laid out")
-            out = _blank(self.shape, self.dtype)
-            for z in range(0, len(self), EDGE):
-                slab = self._slices(z, min(z + EDGE, len(self)))
-                target = out[z : z + EDGE]
-                # bytes, not values: minus zero is something
-                rows = slab.view(np.uint8).any(axis=2)
-                target[rows] = slab[rows]
-            out.flags.writeable = False
-            self._whole, self._layer, self._bricks = out, None, self._bricks[:0]  # the parts are not needed any more
-        return self._whole
-
-    def _slices(self, start: int, stop: int) -> np.ndarray:
-        """Return slices start to stop, (stop - start, ny, nx), C-contiguous."""
-        if self._whole is not None:
-            return self._whole[start:stop]
-        out = np.empty((stop - start, *self.shape[1:]), self.dtype)
-        z0, y0, x0 = self._first
-        z = start
-        while z < stop:
-            at, inside = divmod(z + z0, EDGE)
-            n = min(EDGE - inside, stop - z)
-            layer = self._brick_layer(at)[inside : inside + n]
-            out[z - start : z - start + n] = layer[:, y0 : y0 + self.shape[1], x0 : x0 + self.shape[2]]
-            z += n
-        return out
-
-    def _brick_layer(self, at: int) -> np.ndarray:
-        """Return the values (8, 8 by, 8 bx) of one layer of bricks, and keep it, as slabs are thinner than bricks."""
-        if self._layer is None or self._layer[0] != at:
-            by, bx = self._which.shape[1:]
-            out = np.empty((EDGE, by, EDGE, bx, EDGE), self.dtype)
-            out[:] = self._fill[at][None, :, None, :, None]
-            j, i = np.nonzero(self._which[at] >= 0)
-            # bricks are (n, x, y, z); indices apart put n first: (n, z, y, x)
-            out[:, j, :, i, :] = self._bricks[self._which[at, j, i]].transpose(0, 3, 2, 1)
-            self._layer = (at, out.reshape(EDGE, by * EDGE, bx * EDGE))
-        return self._layer[1]
 
 
 def brick_grid(lo: np.ndarray, hi: np.ndarray, itemsize: int, source: str) -> tuple[np.ndarray, np.ndarray]:

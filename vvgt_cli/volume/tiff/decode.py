@@ -25,6 +25,17 @@ _ENGINES: dict[int, Any] = {
 _WHITE_IS_ZERO, _PALETTE = 0, 3
 
 
+def open_image(name: str) -> tuple[Any, str]:
+    """Open a picture with OpenImageIO, to be read as it is stored; return None and why where that is not possible."""
+    import OpenImageIO as oiio
+
+    config = oiio.ImageSpec()
+    config.attribute("oiio:UnassociatedAlpha", 1)  # numbers as stored, not multiplied by alpha
+    config.attribute("oiio:RawColor", 1)
+    image = oiio.ImageInput.open(name, config)
+    return image, "" if image is not None else oiio.geterror()  # else it is printed at the end
+
+
 class Pages(ExitStack):
     """The files of a series, opened as their pages are wanted; a context.
 
@@ -60,17 +71,10 @@ class Pages(ExitStack):
 
     def _image(self, name: str) -> Any:
         """Open a file with OpenImageIO; None where it cannot."""
-        import OpenImageIO as oiio
-
         if name not in self._images:
-            config = oiio.ImageSpec()
-            config.attribute("oiio:UnassociatedAlpha", 1)  # numbers as stored, not multiplied by alpha
-            config.attribute("oiio:RawColor", 1)
-            self._images[name] = oiio.ImageInput.open(name, config)
+            self._images[name], _ = open_image(name)
             if self._images[name] is not None:
                 self.callback(self._images[name].close)
-            else:
-                oiio.geterror()  # else it is printed at the end
         return self._images[name]
 
     def _by_oiio(self, image: Any, page: Any, keyframe: Any) -> np.ndarray | None:

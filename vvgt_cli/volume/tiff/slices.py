@@ -8,17 +8,18 @@ import re
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.headers import fields_of_sections
 from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, listed, select_component, volume_name
-from vvgt_cli.volume.stored import Stored, slice_by_slice
+from vvgt_cli.volume.stored import Slices, stored_or_loaded
 from vvgt_cli.volume.tiff import KINDS, SUFFIXES, TIFF
+from vvgt_cli.volume.tiff.decode import open_image
 from vvgt_cli.volume.tiff.reader import read_tiff
 
 MAX_FILES = 100_000  # files
@@ -79,27 +80,25 @@ def read_slices(files: list[Path], options: ReadOptions, source: str, name: str)
     if not unit and spacing == options.spacing_or((1.0, 1.0, 1.0)):
         size = (plane.shape[2], plane.shape[1])
         spacing, unit = log_spacing(files[0], size, step, options.spacing) or (spacing, unit)
-    field: Any = _lazy(files, plane, read, source)
-    if not options.stored:
-        check_memory(field.nbytes, source)
-        field = field[:]
+    shape = (len(files), *plane.shape[1:])
+    part = partial(_part, files, plane, read)
+    field = stored_or_loaded(part, plane.dtype, shape, (1, *plane.shape[1:]), source, options.stored)
     return Volume(field, spacing, name=name, unit=unit)
 
 
-def _lazy(files: list[Path], plane: np.ndarray, load: Callable[[Path], np.ndarray], source: str) -> Stored:
-    """Return slices that stay in their files; ``load`` reads one as (1, y, x), all as ``plane``, the first of them."""
-
-    def read(k: int) -> np.ndarray:
-        values = load(files[k])
+def _part(files: list[Path], plane: np.ndarray, load: Callable[[Path], np.ndarray], slices: Slices) -> np.ndarray:
+    """Read a box of slices; ``load`` reads one as (1, y, x), all as ``plane``, the first of them."""
+    z, y, x = slices
+    out = np.empty([s.stop - s.start for s in slices], plane.dtype)
+    for row, file in zip(out, files[z], strict=True):
+        values = load(file)
         if values.shape != plane.shape or values.dtype != plane.dtype:
             raise DataError(
-                f"{files[k]}: {values.shape[2]} x {values.shape[1]} {values.dtype}; expected {plane.shape[2]} x "
+                f"{file}: {values.shape[2]} x {values.shape[1]} {values.dtype}; expected {plane.shape[2]} x "
                 f"{plane.shape[1]} {plane.dtype} as in {files[0].name}"
             )
-        only: np.ndarray = values[0]
-        return only
-
-    return slice_by_slice(read, plane.dtype, (len(files), *plane.shape[1:]), source)
+        row[...] = values[0, y, x]
+    return out
 
 
 def read_glob(pattern: str, options: ReadOptions) -> Volume | None:
@@ -162,13 +161,8 @@ def read_pixels(path: Path) -> np.ndarray:
     Raises:
         DataError: no picture, or a damaged one; not enough memory.
     """
-    import OpenImageIO as oiio
-
-    config = oiio.ImageSpec()
-    config.attribute("oiio:UnassociatedAlpha", 1)
-    config.attribute("oiio:RawColor", 1)
-    image = oiio.ImageInput.open(str(path), config)
-    kind, pixels, error = ("", None, oiio.geterror()) if image is None else (image.format_name(), None, "")
+    image, error = open_image(str(path))
+    kind, pixels = ("", None) if image is None else (image.format_name(), None)
     if image is not None and kind in KINDS:
         spec = image.spec()
         check_memory(spec.image_bytes(), str(path))

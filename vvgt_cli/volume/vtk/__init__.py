@@ -12,7 +12,7 @@ from collections.abc import Callable
 from vvgt_cli.volume.headers import MARK
 from vvgt_cli.volume.readers import HDF5, Reader, lazy
 
-INDEX, SINGLE = "index", "single"  # what `child` reads beside programs' files: an index of VTK's files, or one of these
+INDEX, SINGLE, IMAGE = "index", "single", "image"  # what `child` reads beside programs' files: VTK's own
 GRIDS = ("UnstructuredGrid", "RectilinearGrid", "StructuredGrid")
 LEGACY_GRIDS = ("UNSTRUCTURED_GRID", "RECTILINEAR_GRID", "STRUCTURED_GRID")
 INDEXES = (

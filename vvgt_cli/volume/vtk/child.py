@@ -26,18 +26,21 @@ from vvgt_cli.resources import free_memory
 from vvgt_cli.volume.arrays.grib import GRIB, grib_volume
 from vvgt_cli.volume.readers import HDF5, HEAD_BYTES, volume_name
 from vvgt_cli.volume.reading import ArrayInfo, ReadOptions, Volume, check_memory, count
-from vvgt_cli.volume.vtk import GRIDS, INDEX, INDEXES, SINGLE, is_index, is_legacy, xml_kind
-from vvgt_cli.volume.vtk.grids import arrays_of, check_legacy_grid, check_xml_grid, values_of
+from vvgt_cli.volume.vtk import GRIDS, IMAGE, INDEX, INDEXES, SINGLE, is_index, is_legacy, xml_kind
+from vvgt_cli.volume.vtk.grids import arrays_of, values_of
 from vvgt_cli.volume.vtk.index import PIECES, Index, files_of, read_index
 from vvgt_cli.volume.vtk.leaves import Leaf, arrays_in, leaves_of
+from vvgt_cli.volume.vtk.legacy import check_legacy_grid
 from vvgt_cli.volume.vtk.messages import checked, quiet_vtk
 from vvgt_cli.volume.vtk.programs import PROGRAMS, read_program
 from vvgt_cli.volume.vtk.resample import MAX_EDGE
+from vvgt_cli.volume.vtk.xml import scan
 
 SECONDS, A_BYTE, A_VOXEL = 60, 1e-6, 4e-6  # processor time: at least, of a byte of the files, of a sample
 START = f"from {__name__} import main; main()"
 IDLE, LOOK = 60.0, 2.0  # s without any processor time after which it counts as hung, and between looks
 STOPPED = {-getattr(signal, name, -1 << 30) for name in ("SIGXCPU", "SIGKILL")}  # exit statuses; no others on Windows
+ERRORS = (SeveralSteps, SeveralArrays, SeveralComponents)  # with attributes, which go from process to process
 KEYS = ("dims", "spacing", "array", "component", "time")
 MAX_ROWS = 50  # of steps, arrays or blocks each that `contents_of` lists
 LARGEST = 1 << 20  # bytes of the line of an answer
@@ -80,7 +83,7 @@ def contents_by_child(program: str, path: Path, options: ReadOptions) -> dict[st
 
 
 def _asked(program: str, path: Path, options: ReadOptions, task: str) -> tuple[dict[str, Any], np.ndarray]:
-    size = path.stat().st_size if program == SINGLE else _bytes_near(path)
+    size = path.stat().st_size if program in (SINGLE, IMAGE) else _bytes_near(path)
     samples = count(options.dims) if options.dims else min(40 * size, MAX_EDGE**3)
     seconds = math.ceil(SECONDS + A_BYTE * size + A_VOXEL * samples)
     request = {
@@ -163,7 +166,11 @@ def received(stream: IO[bytes]) -> tuple[dict[str, Any], np.ndarray] | None:
 
 
 def _ended(path: Path, program: str, status: int, seconds: int) -> DataError:
-    who = "ecCodes" if program == GRIB else f"VTK's reader of {'VTK' if program in (INDEX, SINGLE) else program} files"
+    who = (
+        "ecCodes"
+        if program == GRIB
+        else f"VTK's reader of {'VTK' if program in (INDEX, SINGLE, IMAGE) else program} files"
+    )
     if status in STOPPED:
         return DataError(
             f"{path}: {who} was stopped (after {seconds} s, a minute of standstill, or for its memory); is it whole?"
@@ -174,17 +181,11 @@ def _ended(path: Path, program: str, status: int, seconds: int) -> DataError:
 
 def _error(facts: dict[str, Any]) -> VvgtError:
     """Make the error that an answer reports."""
-    text, kind = facts["text"], facts["error"]
-    made: VvgtError
-    if kind == "SeveralSteps":
-        made = SeveralSteps("", facts["steps"], times=facts["times"])
-        made.args = (text,)
-        return made
-    if kind == "SeveralArrays":
-        return SeveralArrays(text, "--array", facts["choices"])
-    if kind == "SeveralComponents":
-        return SeveralComponents(text, facts["count"], facts["color"])
-    return UsageError(text) if kind == "UsageError" else DataError(text)
+    kind = next((kind for kind in (*ERRORS, UsageError) if kind.__name__ == facts["error"]), DataError)
+    error = kind.__new__(kind)
+    error.args = (facts["text"],)
+    vars(error).update(facts.get("state", {}))
+    return error
 
 
 def answer(request: dict[str, Any]) -> tuple[dict[str, Any], np.ndarray | None]:
@@ -199,25 +200,17 @@ def answer(request: dict[str, Any]) -> tuple[dict[str, Any], np.ndarray | None]:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             facts, values = _work(request["program"], path, options, request["task"])
-    except VvgtError as error:
-        facts, values = {"error": type(error).__name__, "text": str(error)}, None
-        if isinstance(error, SeveralSteps):
-            facts |= {"steps": error.steps, "times": [float(time) for time in error.times or ()]}
-        if isinstance(error, SeveralArrays) and request["program"] == GRIB:
-            return facts | {"choices": error.choices, "notes": []}, None
-        if isinstance(error, SeveralComponents):
-            facts |= {"count": error.count, "color": error.color}
-        if facts["error"] not in ("SeveralSteps", "SeveralComponents"):
-            facts["error"] = "UsageError" if isinstance(error, UsageError) else "DataError"
-    except MemoryError:
-        facts, values = (
-            {"error": "DataError", "text": f"{path}: not enough memory to read it; try a machine with more"},
-            None,
-        )
+    except (*ERRORS, UsageError) as error:
+        facts, values = {"error": type(error).__name__, "text": str(error), "state": vars(error)}, None
+        if isinstance(error, SeveralArrays) and request["program"] not in (GRIB, IMAGE):  # others list them
+            facts |= {"error": "UsageError", "state": {}}
     except Exception as error:  # of readers that were given anything
         text = " ".join(str(error).split())[:300] or type(error).__name__
-        facts, values = {"error": "DataError", "text": f"{path}: damaged ({text}); check that it is whole"}, None
-    again = facts.get("error") in ("SeveralSteps", "SeveralComponents")  # the question repeats them
+        text = f"{path}: damaged ({text}); check that it is whole"
+        if isinstance(error, MemoryError):
+            text = f"{path}: not enough memory to read it; try a machine with more"
+        facts, values = {"error": "DataError", "text": str(error) if isinstance(error, VvgtError) else text}, None
+    again = facts.get("error") in [kind.__name__ for kind in ERRORS]  # the question repeats them
     notes = [str(one.message) for one in caught if one.category is UserWarning and not again]
     return {**facts, "notes": notes}, values
 
@@ -285,7 +278,7 @@ def datasets(program: str, path: Path, time: int | None, array: str | None = Non
         DataError: damaged, or a file that is named is missing or lies elsewhere.
         UsageError: several time steps and none chosen, or one that there is not.
     """
-    if program == SINGLE:
+    if program in (SINGLE, IMAGE):
         return list(_dataset(path, ())), []
     if program != INDEX:
         return read_program(PROGRAMS[program], path, time, array)
@@ -326,8 +319,7 @@ def _reader(path: Path, kind: str | None, head: bytes) -> Any:
     from vtkmodules.vtkIOLegacy import vtkDataSetReader
 
     if kind in ("ImageData", "PolyData", *GRIDS):
-        if kind in GRIDS:
-            check_xml_grid(path)
+        scan(path)  # raises where the end of the file is missing
         return getattr(vtkIOXML, f"vtkXML{kind}Reader")()
     if head.startswith(b"# vtk DataFile"):
         if is_legacy(head, grid=True):

@@ -1,107 +1,18 @@
-"""VTK's meshes and grids: the checks of their files, and datasets in memory as volumes, resampled.
+"""Arrays and hidden cells of VTK's datasets in memory, and images as volumes.
 
-Declared sizes are checked against the file before VTK allocates, cells against points before VTK walks them.
+Cells are compared with points before VTK walks them.
 """
 
 from __future__ import annotations
 
-import mmap
-from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.volume.components import ArrayInfo, choose_array, select_from_array
-from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, count, placed, printable, size_text
-from vvgt_cli.volume.vtk import LEGACY_GRIDS
-from vvgt_cli.volume.vtk.blocks import check_blocks
-from vvgt_cli.volume.vtk.legacy import Parser
-from vvgt_cli.volume.vtk.resample import resample
-from vvgt_cli.volume.vtk.xml import GHOSTS, HIDDEN, around, extent_dims, scan, stored_ratio, without
-
-
-def check_xml_grid(path: Path) -> str:
-    """Return the type of a ``.vtu``, ``.vtr`` or ``.vts``; raise DataError if it cannot hold what it declares."""
-    header = scan(path)
-    points, cells = header.points, header.cells
-    if header.image:
-        dims = extent_dims(header.image, path)
-        points, cells = count(tuple(dims)), count(tuple(max(d - 1, 1) for d in dims))
-    need = 12 * points if header.kind == "StructuredGrid" else 0
-    if header.kind == "UnstructuredGrid":
-        need = 12 * points + 5 * cells  # coordinates; an offset and a type a cell
-    for info, _ in header.arrays:
-        need += (points if info.where == "point" else cells) * info.components * np.dtype(info.dtype).itemsize
-    size = path.stat().st_size
-    if need > size * stored_ratio(header, path):
-        raise DataError(f"{path}: {size_text(size)} cannot hold {points} points and {cells} cells; is the file whole?")
-    check_memory(need, str(path))
-    check_blocks(path, header.root, header.appended, header.data_start, stored_ratio(header, path))
-    return header.kind
-
-
-class _Sections(Parser):
-    """The sections of a legacy mesh or grid, to see that the file holds what they declare."""
-
-    KINDS = LEGACY_GRIDS
-
-    def section(self, key: str, words: list[str]) -> None:
-        if key in ("X_COORDINATES", "Y_COORDINATES", "Z_COORDINATES"):
-            self.skip(words[2].lower(), int(words[1]))
-        elif key == "POINTS":
-            self.skip(words[2].lower(), 3 * int(words[1]))
-        elif key == "CELL_TYPES":
-            self.skip("int", int(words[1]))
-        elif key == "CELLS":
-            self.cells(int(words[1]), int(words[2]))
-        else:
-            super().section(key, words)
-
-    def cells(self, first: int, second: int) -> None:
-        """Skip cells, stored as numbers in a row (version 4) or as offsets and connectivity (5.1)."""
-        back = self.position
-        line = self.text[back : back + 64].split(None, 2)
-        if not line or line[0] != b"OFFSETS":
-            self.skip("int", second)
-            return
-        for n in (first, second):
-            words = self.words() or []
-            if len(words) != 2:
-                raise self.bad("CELLS without OFFSETS and CONNECTIVITY")
-            self.skip(words[1].lower(), n)
-
-
-def check_legacy_grid(path: Path) -> None:
-    """Raise DataError if a legacy ``.vtk`` mesh or grid does not hold what its sections declare."""
-    with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
-        _Sections(text, path).parse()
-
-
-def dataset_volume(mesh: Any, options: ReadOptions, source: str, name: str) -> Volume:
-    """Make a volume of a vtkDataSet (pyvista's are): an image as it is, any other grid or mesh of cells resampled.
-
-    Errors are those of `Reader.read`.
-    """
-    if not mesh.IsA("vtkDataSet"):
-        raise DataError(f"{source}: a {mesh.GetClassName()}; expected one image, grid or mesh of cells")
-    if mesh.IsA("vtkPolyData"):
-        raise DataError(f"{source}: a surface (vtkPolyData); expected cells that fill a volume")
-    infos = arrays_of(mesh)
-    info = infos[choose_array(infos, options.array, source)]
-    if mesh.IsA("vtkImageData"):
-        return replace(_image(mesh, info, options, source, name), quantity=printable(info.name))
-    if options.spacing is not None:
-        raise UsageError(
-            f"{source}: its points say where values are; leave out --spacing (--dims says how many to take)"
-        )
-    check_cells(mesh, source)
-    mesh = shown(mesh)
-    values = values_of(mesh, info).reshape(1, 1, -1, info.components)
-    field = select_from_array(values, info, options.component, source)
-    volume = resample(mesh, field.ravel(), info.where, options.dims, source, name)
-    return replace(volume, quantity=printable(info.name))
+from vvgt_cli.volume.components import ArrayInfo, select_from_array
+from vvgt_cli.volume.reading import ReadOptions, Volume, float_dtype, placed, printable
+from vvgt_cli.volume.vtk.xml import GHOSTS, HIDDEN
 
 
 def values_of(mesh: Any, info: ArrayInfo) -> np.ndarray:
@@ -192,6 +103,22 @@ def visible(image: Any, field: np.ndarray, where: str) -> np.ndarray:
     return field
 
 
+def without(values: np.ndarray, hidden: np.ndarray) -> np.ndarray:
+    """Set ``values`` to NaN where ``hidden``; return them as they are where nothing is."""
+    if not hidden.any():
+        return values
+    return np.where(hidden, np.nan, values).astype(float_dtype(values.dtype))
+
+
+def around(cells: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Mask the points (nz, ny, nx) whose surrounding cells are all in ``cells``, a mask."""
+    for axis, n in enumerate(shape):
+        if n > cells.shape[axis]:
+            ones = np.ones_like(np.take(cells, [0], axis))
+            cells = np.concatenate([ones, cells], axis) & np.concatenate([cells, ones], axis)
+    return cells
+
+
 def image_place(image: Any, where: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return dims, spacing and first position (x, y, z) of the points of a vtkImageData, or of its cell centres."""
     low = np.array(image.GetExtent()[::2], float)
@@ -206,11 +133,12 @@ def _direction(image: Any) -> np.ndarray:
     return np.array([[matrix.GetElement(r, c) for c in range(3)] for r in range(3)])
 
 
-def _image(image: Any, info: ArrayInfo, options: ReadOptions, source: str, name: str) -> Volume:
+def image_volume(image: Any, info: ArrayInfo, options: ReadOptions, source: str, name: str) -> Volume:
     """Make a volume of a vtkImageData: point data, or cell data on the grid of cell centres."""
     if options.dims is not None:
         raise UsageError(f"{source}: an image, which is a regular grid already; leave out --dims")
     dims, spacing, origin = image_place(image, info.where)
     values = values_of(image, info).reshape(*dims[::-1], info.components)
     field = visible(image, select_from_array(values, info, options.component, source), info.where)
-    return placed(field, (_direction(image) * spacing).T, origin, options, name)
+    steps = (_direction(image) * spacing).T
+    return placed(field, steps, origin, options, name, quantity=printable(info.name))

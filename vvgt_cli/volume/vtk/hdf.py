@@ -13,7 +13,7 @@ import numpy as np
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.arrays.hdf5 import checked_dataset
 from vvgt_cli.volume.components import ArrayInfo, choose_array, selected_dtype
-from vvgt_cli.volume.reading import ReadOptions, Volume, library_errors, printable, read_part, text_of, volume_name
+from vvgt_cli.volume.reading import ReadOptions, Volume, printable, read_part, text_of, volume_name
 from vvgt_cli.volume.stored import Slices, stored_or_loaded
 from vvgt_cli.volume.vtk.child import volume_by_child
 from vvgt_cli.volume.vtk.index import chosen_time
@@ -29,7 +29,7 @@ def read_vtkhdf(path: Path, options: ReadOptions) -> Volume:
         import h5py
     except ImportError:
         return volume_by_child("VTKHDF", path, options)
-    with library_errors(str(path), "VTKHDF"), h5py.File(path, "r") as file:
+    with h5py.File(path, "r") as file:
         root = file.get("VTKHDF")
         if isinstance(root, h5py.Group) and options.component != "magnitude":
             hidden = any(f"{group}/{GHOSTS}" in root for group in GROUPS.values())

@@ -16,7 +16,7 @@ from pathlib import Path
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.headers import MARK
 from vvgt_cli.volume.reading import ReadOptions, data_file
-from vvgt_cli.volume.vtk.blocks import walk_xml
+from vvgt_cli.volume.vtk.xml import walk_xml
 
 MAX_FILES = 100_000  # files that an index may name
 DEEPEST = 8  # indexes that name indexes

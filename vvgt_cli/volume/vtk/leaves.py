@@ -14,7 +14,7 @@ import numpy as np
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.components import ArrayInfo, choose_array, select_from_array
 from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, count, float_dtype, printable, triple
-from vvgt_cli.volume.vtk.grids import arrays_of, check_cells, dataset_volume, image_place, shown, values_of
+from vvgt_cli.volume.vtk.grids import arrays_of, check_cells, image_place, image_volume, shown, values_of, visible
 from vvgt_cli.volume.vtk.resample import MAX_EDGE, Samples, grid_of, probe, sampled_volume
 
 ALIGNED = 1e-3  # voxels that images of one lattice may lie off
@@ -72,6 +72,16 @@ def arrays_in(leaves: Sequence[Leaf]) -> list[ArrayInfo]:
     return list(infos.values())
 
 
+def dataset_volume(mesh: Any, options: ReadOptions, source: str, name: str) -> Volume:
+    """Make a volume of a vtkDataSet (pyvista's are): an image as it is, any other grid or mesh of cells resampled.
+
+    Errors are those of `Reader.read`.
+    """
+    if not mesh.IsA("vtkDataSet"):
+        raise DataError(f"{source}: a {mesh.GetClassName()}; expected one image, grid or mesh of cells")
+    return volume_of([Leaf(mesh)], options, source, name)
+
+
 def volume_of(leaves: Sequence[Leaf], options: ReadOptions, source: str, name: str) -> Volume:
     """Make a volume of the array that is asked for, from all datasets with it; errors are those of `Reader.read`."""
     if not leaves:
@@ -80,18 +90,17 @@ def volume_of(leaves: Sequence[Leaf], options: ReadOptions, source: str, name: s
         check_cells(leaf.data, source)
     filled = (leaf for leaf in leaves if leaf.data.GetNumberOfCells() > 0 and not leaf.data.IsA("vtkPolyData"))
     deep = [leaf for leaf in filled if leaf.data.GetMaxSpatialDimension() == 3]
-    if len(leaves) == 1 or not deep:
-        return dataset_volume(leaves[0].data, options, source, name)
-    infos = arrays_in(deep)
-    if not infos:
-        raise DataError(f"{source}: no array of numbers in its {len(deep)} blocks; expected at least one")
+    chosen = deep if deep and len(leaves) > 1 else leaves[:1]
+    if chosen[0].data.IsA("vtkPolyData"):
+        raise DataError(f"{source}: a surface (vtkPolyData); expected cells that fill a volume")
+    infos = arrays_in(chosen)
     info = infos[choose_array(infos, options.array, source)]
-    holders = [leaf for leaf in deep if any((a.name, a.where) == (info.name, info.where) for a in arrays_of(leaf.data))]
-    if len(holders) == 1:
-        return dataset_volume(holders[0].data, replace(options, array=info.name), source, name)
+    holders = [one for one in chosen if any((a.name, a.where) == (info.name, info.where) for a in arrays_of(one.data))]
+    if len(holders) == 1 and holders[0].data.IsA("vtkImageData"):
+        return image_volume(holders[0].data, info, options, source, name)
     if options.spacing is not None:
         raise UsageError(
-            f"{source}: its blocks say where values are; leave out --spacing (--dims says how many to take)"
+            f"{source}: its points say where values are; leave out --spacing (--dims says how many to take)"
         )
     fields = [_field(leaf, info, options, source) for leaf in holders]
     dtype = np.result_type(*(values.dtype for _, values in fields))
@@ -100,7 +109,7 @@ def volume_of(leaves: Sequence[Leaf], options: ReadOptions, source: str, name: s
     check_memory(count(grid.dims) * (float_dtype(dtype).itemsize + 1), source)
     out = np.full(grid.dims[::-1], np.nan, float_dtype(dtype))
     for leaf, values in sorted(fields, key=_coarseness):
-        _paint(leaf.data, values, info.where, grid, out)
+        _paint(leaf.data, values, info.where, grid, lattice is not None, out)
     inside = ~np.isnan(out)
     if lattice is None:
         volume = sampled_volume(out, inside, dtype, grid, options.dims, source, name)
@@ -118,13 +127,15 @@ def _coarseness(row: tuple[Leaf, np.ndarray]) -> tuple[int, float]:
 
 def _field(leaf: Leaf, info: ArrayInfo, options: ReadOptions, source: str) -> tuple[Leaf, np.ndarray]:
     """Return a dataset without its hidden cells, and the scalars (n,) of its points or cells."""
-    image = leaf.data.IsA("vtkImageData")
-    data = leaf.data if image else shown(leaf.data)
+    data = leaf.data if leaf.data.IsA("vtkImageData") else shown(leaf.data)
     own = next((a for a in arrays_of(data) if (a.name, a.where) == (info.name, info.where)), info)
     if own.components != info.components:
         raise DataError(f"{source}: array {info.name!r} has {own.components} components in block {leaf.name}")
     values = values_of(data, own).reshape(1, 1, -1, own.components)
-    return replace(leaf, data=data), select_from_array(values, info, options.component, source).ravel()
+    field = select_from_array(values, info, options.component, source).ravel()
+    if data.IsA("vtkImageData"):
+        field = visible(data, field.reshape(image_place(data, info.where)[0][::-1]), info.where).ravel()
+    return replace(leaf, data=data), field
 
 
 def _lattice(images: Sequence[Any], where: str) -> Samples | None:
@@ -157,6 +168,8 @@ def _samples(leaves: Sequence[Leaf], dims: tuple[int, int, int] | None, source: 
     bounds = np.array([leaf.data.GetBounds() for leaf in leaves]).reshape(-1, 3, 2)
     box = np.stack([bounds[..., 0].min(axis=0), bounds[..., 1].max(axis=0)], axis=1)
     cells = sum(leaf.data.GetNumberOfCells() for leaf in leaves)
+    if cells < 1:
+        raise DataError(f"{source}: a mesh without cells; expected some to sample")
     if dims is None and all(leaf.data.IsA("vtkImageData") and _upright(leaf.data) for leaf in leaves):
         finest = np.min([leaf.data.GetSpacing() for leaf in leaves], axis=0)
         if (finest > 0).all() and np.isfinite(box).all():
@@ -165,47 +178,20 @@ def _samples(leaves: Sequence[Leaf], dims: tuple[int, int, int] | None, source: 
     return grid_of(box, dims, cells, source)
 
 
-def _paint(data: Any, values: np.ndarray, where: str, grid: Samples, out: np.ndarray) -> None:
-    """Put the values of a dataset into the samples ``out`` (nz, ny, nx) that lie in it."""
-    bounds = np.array(data.GetBounds()).reshape(3, 2)
+def _paint(data: Any, values: np.ndarray, where: str, grid: Samples, aligned: bool, out: np.ndarray) -> None:
+    """Put the values of a dataset into the samples ``out`` (nz, ny, nx) that lie in it, or are it (``aligned``)."""
     origin, step = np.array(grid.origin), np.array(grid.spacing)
-    lo = np.maximum(np.ceil((bounds[:, 0] - origin) / step - EDGE), 0)
-    hi = np.minimum(np.floor((bounds[:, 1] - origin) / step + EDGE) + 1, grid.dims)
-    if not (lo < hi).all():
-        return
-    begin, end = lo.astype(int), hi.astype(int)
-    part = Samples(triple((end - begin).tolist()), grid.spacing, triple((origin + begin * step).tolist()))
-    if data.IsA("vtkImageData") and _upright(data):
-        sampled, inside = _of_image(data, values, where, part)
+    if aligned:
+        dims, _, first = image_place(data, where)
+        begin = np.round((first - origin) / step).astype(int)
+        end, sampled, inside = begin + dims, values.reshape(dims[::-1]), np.array(True)
     else:
+        bounds = np.array(data.GetBounds()).reshape(3, 2)
+        begin = np.maximum(np.ceil((bounds[:, 0] - origin) / step - EDGE), 0).astype(int)
+        end = np.minimum(np.floor((bounds[:, 1] - origin) / step + EDGE) + 1, grid.dims).astype(int)
+        if not (begin < end).all():
+            return
+        part = Samples(triple((end - begin).tolist()), grid.spacing, triple((origin + begin * step).tolist()))
         sampled, inside = probe(data, values, where, part)
     target = out[tuple(slice(a, b) for a, b in zip(begin[::-1], end[::-1], strict=True))]
-    np.copyto(target, sampled, where=inside, casting="unsafe")
-
-
-def _of_image(image: Any, values: np.ndarray, where: str, grid: Samples) -> tuple[np.ndarray, np.ndarray]:
-    """Sample an upright image, and mask the samples in it: cells are constant, points interpolated linearly."""
-    from vvgt_cli.volume.vtk.grids import visible
-
-    dims, spacing, first = image_place(image, where)
-    field = visible(image, values.reshape(dims[::-1]), where)
-    inside = np.ones(grid.dims[::-1], bool)
-    for axis in range(3):  # x, y, z
-        along = 2 - axis
-        at = (grid.origin[axis] + grid.spacing[axis] * np.arange(grid.dims[axis]) - first[axis]) / spacing[axis]
-        n = int(dims[axis])
-        reach = 0.5 if where == "cell" or n == 1 else 0.0
-        good = (at >= -reach - EDGE) & (at <= n - 1 + reach + EDGE)
-        shape = [1, 1, 1]
-        shape[along] = len(at)
-        inside &= good.reshape(shape)
-        near = np.clip(np.round(at), 0, n - 1).astype(int)
-        if where == "cell" or (np.abs(at - near) < ALIGNED)[good].all():
-            field = np.take(field, near, axis=along)
-            continue
-        low = np.clip(np.floor(at), 0, max(n - 2, 0)).astype(int)
-        part = np.clip(at - low, 0, 1).reshape(shape)
-        field = (
-            np.take(field, low, axis=along) * (1 - part) + np.take(field, np.minimum(low + 1, n - 1), axis=along) * part
-        )
-    return field, inside & ~np.isnan(field)
+    np.copyto(target, sampled, where=inside & ~np.isnan(sampled), casting="unsafe")

@@ -15,11 +15,10 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.resources import free_memory
-from vvgt_cli.volume.blocks import SHARE, check_memory, data_file
+from vvgt_cli.volume.blocks import count, data_file, is_large
 from vvgt_cli.volume.components import ArrayInfo, choose_array, selected_dtype
 from vvgt_cli.volume.reading import ReadOptions, Volume, float_dtype, printable, triple, volume_name
-from vvgt_cli.volume.stored import Slices, Stored, is_file_backed, put_block, read_block
+from vvgt_cli.volume.stored import Slices, is_file_backed, put_block, read_block, stored_or_loaded
 from vvgt_cli.volume.vtk.xml import GHOSTS, HIDDEN, Scan, extent_dims, extent_of, image_grid, image_values, scan
 
 MAX_KEPT = 256 << 20  # bytes of unpacked pieces that a process keeps
@@ -44,11 +43,8 @@ def read_pvti(path: Path, options: ReadOptions) -> Volume:
     pieces = _Pieces(header, info, options, path)
     grid = image_grid(pieces.image, info.where, path)
     shape, dtype = grid.dims[::-1], pieces.dtype
-    field: Any = Stored(pieces.read, dtype, shape, pieces.chunks, str(path))
-    free = free_memory()
-    if not options.stored and (not options.packed or free is None or field.nbytes <= SHARE * free):
-        check_memory(field.nbytes, str(path))
-        field = field[:, :, :]
+    kept = options.stored or (options.packed and is_large(count(shape) * dtype.itemsize))
+    field = stored_or_loaded(pieces.read, dtype, shape, pieces.chunks, str(path), kept)
     place = options.spacing_or(grid.spacing), grid.origin, grid.direction
     return Volume(field, *place, volume_name(path), quantity=printable(info.name))
 
@@ -110,7 +106,7 @@ class _Pieces:
     def _shown(self, k: int) -> bool:
         """Tell whether the ghost marks of piece ``k`` hide nothing, by its header: they may only mark shared values."""
         rows = [row for where in HIDDEN if (row := self._scan(k).find(GHOSTS, where))]
-        return all(row[1].get("RangeMax", "") in ("0", "1") for row in rows)
+        return all(row.attributes.get("RangeMax", "") in ("0", "1") for row in rows)
 
     def read(self, slices: Slices) -> np.ndarray:
         """Read the values of a box, (z, y, x)."""
@@ -160,8 +156,8 @@ class _Pieces:
     def _opened(self, k: int) -> tuple[Volume, np.ndarray]:
         header, file = self._scan(k), self.path.parent / self.names[k]
         row = header.find(self.info.name, self.info.where)
-        if row is None or (row[0].dtype, row[0].components) != (self.info.dtype, self.info.components):
-            text = "none of that name" if row is None else str(row[0])
+        if row is None or (row.info.dtype, row.info.components) != (self.info.dtype, self.info.components):
+            text = "none of that name" if row is None else str(row.info)
             raise DataError(f"{file}: {text}; expected {self.info} as {self.path.name} says")
         grid = image_grid(header.image, self.info.where, file)
         extent = np.array(extent_of(header.image["WholeExtent"], file)).reshape(3, 2)
@@ -176,7 +172,7 @@ class _Pieces:
                 f"{file}: an image of extent {extent.ravel().tolist()} from {header.image.get('Origin')}; expected the "
                 f"place that {self.path.name} gives it"
             )
-        values = image_values(header, row[0], grid, self.options, file)
+        values = image_values(header, row.info, grid, self.options, file)
         return Volume(values, triple(grid.spacing), name=file.name), first
 
 
@@ -193,7 +189,7 @@ def contents_of(path: Path, options: ReadOptions) -> dict[str, Any]:
     pieces = [scan(data_file(path, name)) for name, _ in index.sources[:LISTED]]
     rows = []
     for info in index.infos:
-        stated = [match[1] for piece in pieces if (match := piece.find(info.name, info.where))]
+        stated = [match.attributes for piece in pieces if (match := piece.find(info.name, info.where))]
         row: dict[str, Any] = {
             "array": info.name,
             "data": info.where,

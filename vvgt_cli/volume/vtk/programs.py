@@ -17,10 +17,10 @@ from typing import Any
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import any_case, data_file
 from vvgt_cli.volume.headers import MARK
-from vvgt_cli.volume.vtk.blocks import walk_xml
 from vvgt_cli.volume.vtk.index import MAX_BYTES, chosen_time
 from vvgt_cli.volume.vtk.leaves import Leaf, arrays_in, leaves_of
 from vvgt_cli.volume.vtk.messages import quiet_vtk
+from vvgt_cli.volume.vtk.xml import walk_xml
 
 MAX_NAMES = 100_000  # files that a case may name
 
@@ -235,52 +235,33 @@ def _cgns(path: Path) -> Any:
 
 def _plot3d(path: Path) -> Any:
     """Make the reader of ``NAME.xyz`` with ``NAME.q`` or ``.f`` beside it, or of ParaView's ``.p3d`` (JSON)."""
-    from vtkmodules.vtkIOParallel import vtkMultiBlockPLOT3DReader
+    from vtkmodules.vtkIOParallel import vtkMultiBlockPLOT3DReader, vtkPlot3DMetaReader
 
-    stated: dict[str, Any] = {"auto-detect-format": True}
-    files = {"xyz": path.name}
+    reader: Any
+    kinds = {"xyz": ".xyz", "q": ".q", "function": ".f"}
     if path.suffix.lower() == ".p3d":
         try:
-            stated = json.loads(_small(path))
-            rows = stated["filenames"]
-            files = {key: str(rows[0][key]) for key in ("xyz", "q", "function") if key in rows[0]}
-        except (ValueError, TypeError, KeyError, IndexError) as error:
+            stated = json.loads(_small(path))["filenames"]
+            rows = [{kind: str(row[kind]) for kind in kinds if kind in row} for row in stated]
+        except (ValueError, TypeError, KeyError) as error:
             raise DataError(
                 f'{path}: damaged ({error}); expected JSON with "filenames", an "xyz" among them'
             ) from error
-        if len(rows) != 1 or "xyz" not in files:
-            raise DataError(
-                f'{path}: {len(rows)} entries in "filenames"; expected one, with "xyz" and "q" or "function"'
-            )
+        reader = vtkPlot3DMetaReader()
+        reader.SetFileName(str(path))
     else:
-        for key, suffix in (("q", ".q"), ("function", ".f")):
-            if (beside := any_case(path.with_suffix(suffix))).is_file():
-                files[key] = beside.name
-    if len(files) < 2:
+        beside = {kind: any_case(path.with_suffix(suffix)) for kind, suffix in kinds.items()} | {"xyz": path}
+        rows = [{kind: file.name for kind, file in beside.items() if file.is_file()}]
+        reader = vtkMultiBlockPLOT3DReader()
+        reader.SetAutoDetectFormat(True)
+        for kind, put in (("q", reader.SetQFileName), ("function", reader.SetFunctionFileName)):
+            if kind in rows[0]:
+                put(str(beside[kind]))
+        reader.SetXYZFileName(str(path))
+    if not rows or any(len(row) < 2 or "xyz" not in row for row in rows):
         raise DataError(f"{path}: coordinates alone; expected values beside them, in {path.stem}.q or {path.stem}.f")
-    _check_names(path, list(files.values()))
-    reader = vtkMultiBlockPLOT3DReader()
-    for key, put in (
-        ("xyz", reader.SetXYZFileName),
-        ("q", reader.SetQFileName),
-        ("function", reader.SetFunctionFileName),
-    ):
-        if key in files:
-            put(str(path.parent / files[key]))
-    _describe_plot3d(reader, stated)
+    _check_names(path, [name for row in rows for name in row.values()])
     return reader
-
-
-def _describe_plot3d(reader: Any, stated: dict[str, Any]) -> None:
-    """Tell the reader what a ``.p3d`` states (vtkPlot3DMetaReader's keys)."""
-    reader.SetAutoDetectFormat(bool(stated.get("auto-detect-format", False)))
-    reader.SetBinaryFile(str(stated.get("format", "binary")).lower() != "ascii")
-    (reader.SetByteOrderToLittleEndian if stated.get("byte-order") == "little" else reader.SetByteOrderToBigEndian)()
-    reader.SetHasByteCount(str(stated.get("language", "C")).lower() == "fortran")
-    reader.SetMultiGrid(bool(stated.get("multi-grid", False)))
-    reader.SetIBlanking(bool(stated.get("blanking", False)))
-    reader.SetTwoDimensionalGeometry(bool(stated.get("2D", False)))
-    reader.SetDoublePrecision(stated.get("precision") == 64)
 
 
 def _vtkhdf(path: Path) -> Any:

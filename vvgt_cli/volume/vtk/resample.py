@@ -15,7 +15,7 @@ from vvgt_cli.volume.reading import Volume, check_memory, count, float_dtype, tr
 MAX_EDGE = 512  # voxels along an axis, where nobody said how many
 
 
-def rectilinear(coordinates: Sequence[np.ndarray]) -> Any:
+def _rectilinear(coordinates: Sequence[np.ndarray]) -> Any:
     """Make a vtkRectilinearGrid of points at ascending coordinates along x, y and z."""
     from vtkmodules.util.numpy_support import numpy_to_vtk
     from vtkmodules.vtkCommonDataModel import vtkRectilinearGrid
@@ -28,24 +28,25 @@ def rectilinear(coordinates: Sequence[np.ndarray]) -> Any:
 
 
 def resample(
-    mesh: Any, values: np.ndarray, where: str, dims: tuple[int, int, int] | None, source: str, name: str
+    coordinates: Sequence[np.ndarray], values: np.ndarray, dims: tuple[int, int, int] | None, source: str, name: str
 ) -> Volume:
-    """Sample values on a vtkDataSet on a regular grid that fills the mesh's bounding box (vtkProbeFilter).
+    """Sample values at uneven coordinates along x, y and z on a regular grid that fills their box (vtkProbeFilter).
 
-    Point data are interpolated as the cells do, cell data are constant in a cell. Samples are voxel centres: the first
-    lies half a voxel inside the box. The volume's name says how many there are.
+    They are interpolated linearly. Samples are voxel centres: the first lies half a voxel inside the box. The volume's
+    name says how many there are.
 
-    ``values`` (n,) are scalars of the points or cells (``where``) of the mesh. Without ``dims`` (x, y, z) voxels are
-    cubes, about as many as the mesh has cells, and at most `MAX_EDGE` along an axis.
+    ``values`` (n,) are those of all points, x fastest. Without ``dims`` (x, y, z) voxels are cubes, about as many as
+    there are cells between the points, and at most `MAX_EDGE` along an axis.
 
     Raises:
-        DataError: an empty mesh, or memory that does not suffice.
+        DataError: no cells, or memory that does not suffice.
     """
+    mesh = _rectilinear(coordinates)
     if mesh.GetNumberOfCells() < 1:
         raise DataError(f"{source}: a mesh without cells; expected some to sample")
     grid = grid_of(np.array(mesh.GetBounds()).reshape(3, 2), dims, mesh.GetNumberOfCells(), source)
     check_memory(count(grid.dims) * 2 * values.itemsize, source)
-    sampled, inside = probe(mesh, values, where, grid)
+    sampled, inside = probe(mesh, values, "point", grid)
     return sampled_volume(np.where(inside, sampled, np.nan), inside, values.dtype, grid, dims, source, name)
 
 

@@ -1,45 +1,89 @@
-"""VTK XML images (``.vti``), read by VTK.
+"""VTK XML: what a file declares, and images (``.vti``) that lie in their file in one piece.
 
-A plain (raw, appended) array is memory-mapped instead; a compressed one may be unpacked box by box (`packed`). The XML
-is scanned first: sizes are checked against the file before VTK allocates. VTK's messages become one error.
-
-Compressed arrays are unpacked as far as a box needs them: behind the words that `blocks` checks, the packed blocks
-follow each other, in base64 as one string. Each is unpacked by itself (vtkXMLDataParser::ReadBlock).
+A plain (raw, appended) array is memory-mapped, a compressed one unpacked as far as a box needs it: behind the words
+before the blocks (their number, bytes of one and of the last, 0 as the others, packed bytes of each), the packed blocks
+follow each other, in base64 as one string (vtkXMLDataParser::ReadBlock). Others are read by VTK (`child`).
 """
 
 from __future__ import annotations
 
 import base64
+import binascii
 import lzma
 import re
 import zlib
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
+from xml.parsers import expat
 
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.blocks import check_memory, count, load_block, size_text
-from vvgt_cli.volume.components import ArrayInfo, choose_array, select_from_array, selected_dtype
-from vvgt_cli.volume.readers import HEAD_BYTES, volume_name
-from vvgt_cli.volume.reading import ReadOptions, Slices, Stored, printable, type_of, unit_rows
-from vvgt_cli.volume.types import IDENTITY, Volume, float_dtype
-from vvgt_cli.volume.vtk import xml_kind
-from vvgt_cli.volume.vtk.blocks import block_table, check_blocks, walk_xml
-from vvgt_cli.volume.vtk.messages import checked, quiet_vtk
+from vvgt_cli.volume.blocks import count, load_block
+from vvgt_cli.volume.components import ArrayInfo, choose_array, magnitude, select_from_array, selected_dtype
+from vvgt_cli.volume.readers import HEAD_BYTES, lazy, volume_name
+from vvgt_cli.volume.reading import ReadOptions, Slices, printable, type_of, unit_rows
+from vvgt_cli.volume.stored import stored_or_loaded
+from vvgt_cli.volume.types import IDENTITY, Volume
+from vvgt_cli.volume.vtk import IMAGE, xml_kind
+from vvgt_cli.volume.vtk.messages import quiet_vtk
 
-# Most that a byte of the file can stand for: deflate 1032, LZ4 255, LZMA some 7000; "0 " for a double in text.
-_RATIO = {"": 4, "vtkZLibDataCompressor": 1040, "vtkLZ4DataCompressor": 256, "vtkLZMADataCompressor": 10000}
 DATA = {"PointData": "point", "CellData": "cell", "PPointData": "point", "PCellData": "cell"}
 GHOSTS = "vtkGhostType"  # array of marks: bit 1 of a point and bit 5 of a cell hide it (vtkDataSetAttributes)
 HIDDEN = {"point": 2, "cell": 32}
 TAIL = 4096  # bytes in which a file with appended data ends
+LZMA_MEMORY = 1 << 28  # bytes of its dictionary
+IMAGE_BY_VTK = lazy("vtk.child.volume_by_child", IMAGE)  # path and options to volume
+_CHUNK = 1 << 16
+
+
+def walk_xml(
+    path: Path, start: Callable[[str, dict[str, str], int], bool | None], end: Callable[[str], None],
+    text: Callable[[str], None] | None = None,
+) -> None:  # fmt: skip
+    """Call ``start``, ``end`` and ``text`` for the elements of an XML file.
+
+    ``start`` is told the byte at which an element begins; where it returns True, nothing is read from there on.
+
+    Raises:
+        DataError: damaged, or it declares entities.
+    """
+    parser, ended = expat.ParserCreate(), False
+
+    def begin(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal ended
+        ended = ended or bool(start(tag, attributes, parser.CurrentByteIndex))
+
+    def entity(*_: object) -> None:
+        raise DataError(f"{path}: its XML declares entities; expected none")
+
+    parser.StartElementHandler, parser.EndElementHandler, parser.CharacterDataHandler = begin, end, text
+    parser.EntityDeclHandler = entity
+    with open(path, "rb") as file:
+        try:
+            while not ended and (chunk := file.read(_CHUNK)):
+                parser.Parse(chunk)
+            if not ended:
+                parser.Parse(b"", True)
+        except expat.ExpatError as error:
+            if not ended:
+                raise DataError(f"{path}: its XML is damaged ({error}); check that the file is whole") from error
+
+
+@dataclass(frozen=True)
+class DataArray:
+    """An array of a file: what it is, the attributes of its element, and the byte at which that begins."""
+
+    info: ArrayInfo
+    attributes: dict[str, str]
+    position: int
 
 
 @dataclass
 class Scan:
-    """The contents of the XML; arrays are those of the first piece, points and cells of all.
+    """The contents of the XML; arrays are those of the first piece.
 
     In an index of pieces, ``sources`` are the files that it names, with their extents.
     """
@@ -48,11 +92,9 @@ class Scan:
     root: dict[str, str] = field(default_factory=dict)
     image: dict[str, str] = field(default_factory=dict)
     pieces: int = 0
-    points: int = 0
-    cells: int = 0
     where: str = ""
     active: dict[str, str] = field(default_factory=dict)
-    arrays: list[tuple[ArrayInfo, dict[str, str]]] = field(default_factory=list)
+    arrays: list[DataArray] = field(default_factory=list)
     sources: list[tuple[str, str]] = field(default_factory=list)
     appended: str = ""
     data_start: int = -1
@@ -60,11 +102,11 @@ class Scan:
     @property
     def infos(self) -> list[ArrayInfo]:
         """The arrays that may be chosen: ghost marks are not values."""
-        return [info for info, _ in self.arrays if info.name != GHOSTS]
+        return [one.info for one in self.arrays if one.info.name != GHOSTS]
 
-    def find(self, name: str, where: str) -> tuple[ArrayInfo, dict[str, str]] | None:
-        """Return an array and its attributes, None where there is none of the name."""
-        return next((row for row in self.arrays if (row[0].name, row[0].where) == (name, where)), None)
+    def find(self, name: str, where: str) -> DataArray | None:
+        """Return an array, None where there is none of the name."""
+        return next((one for one in self.arrays if (one.info.name, one.info.where) == (name, where)), None)
 
 
 def scan(path: Path) -> Scan:
@@ -78,15 +120,13 @@ def scan(path: Path) -> Scan:
             header.image = attributes
         elif tag == "Piece":
             header.pieces += 1
-            header.points += int(attributes.get("NumberOfPoints", "0"))
-            header.cells += int(attributes.get("NumberOfCells", "0"))
             if "Source" in attributes:
                 header.sources.append((attributes["Source"], attributes.get("Extent", "")))
         elif tag in DATA:
             header.where = DATA[tag]
             header.active[header.where] = attributes.get("Scalars", "")
         elif tag in ("DataArray", "PDataArray") and header.where and header.pieces == (tag == "DataArray"):
-            _note_array(header, attributes, path)
+            _note_array(header, attributes, position, path)
         elif tag == "AppendedData":
             header.appended, header.data_start = attributes.get("encoding", ""), position
         return header.data_start >= 0
@@ -98,19 +138,28 @@ def scan(path: Path) -> Scan:
     walk_xml(path, start, end)
     if header.data_start >= 0:
         with open(path, "rb") as file:
-            file.seek(header.data_start)
-            mark = re.match(rb"[^>]*>\s*_", file.read(4096))
+            start_of_data = _text_of(path, header.data_start)
+            file.seek(start_of_data)
+            mark = file.read(1) == b"_"
             file.seek(max(path.stat().st_size - TAIL, 0))
             ends = b"</VTKFile" in file.read()
         if not ends:  # VTK's readers leave what is missing as it is in memory
             raise DataError(f"{path}: it does not end with </VTKFile>; the file was cut off, copy or write it again")
-        if mark is None:  # VTK's reader would begin elsewhere
+        if not mark:  # VTK's reader would begin elsewhere
             raise DataError(f"{path}: its appended data do not begin with _; check that the file is whole")
-        header.data_start += mark.end()
+        header.data_start = start_of_data + 1
     return header
 
 
-def _note_array(document: Scan, attributes: dict[str, str], path: Path) -> None:
+def _text_of(path: Path, position: int) -> int:
+    """Return the byte of the first character, no blank, behind the tag at a position."""
+    with open(path, "rb") as file:
+        file.seek(position)
+        tag = re.match(rb"[^>]*>\s*", file.read(4096))
+    return position + (tag.end() if tag else 0)
+
+
+def _note_array(header: Scan, attributes: dict[str, str], position: int, path: Path) -> None:
     dtype = type_of(attributes.get("type", ""), {"bit": "u1"})
     if dtype is None:
         return
@@ -118,8 +167,9 @@ def _note_array(document: Scan, attributes: dict[str, str], path: Path) -> None:
     if components < 1:
         raise DataError(f"{path}: array {attributes.get('Name')!r} has {components} components")
     name = attributes.get("Name", "")
-    active = bool(name) and name == document.active.get(document.where)
-    document.arrays.append((ArrayInfo(name, document.where, components, dtype.name, active), attributes))
+    active = bool(name) and name == header.active.get(header.where)
+    info = ArrayInfo(name, header.where, components, dtype.name, active)
+    header.arrays.append(DataArray(info, attributes, position))
 
 
 def _numbers(text: str, n: int, path: Path, what: str) -> list[float]:
@@ -156,14 +206,6 @@ def extent_dims(image: dict[str, str], path: Path) -> list[int]:
     return dims
 
 
-def stored_ratio(document: Scan, path: Path) -> int:
-    """Return the most bytes of values that a byte can stand for; raise DataError for an unknown compressor."""
-    compressor = document.root.get("compressor", "")
-    if compressor not in _RATIO:
-        raise DataError(f"{path}: compressor {compressor!r}; expected one of {', '.join(filter(None, _RATIO))}")
-    return _RATIO[compressor]
-
-
 def image_grid(image: dict[str, str], where: str, path: Path) -> Grid:
     """Return the grid of points, or of cell centres (half a voxel further, one fewer per axis), or raise DataError."""
     extent, dims = extent_of(image.get("WholeExtent", ""), path), extent_dims(image, path)
@@ -190,8 +232,7 @@ def read_vti(path: Path, options: ReadOptions) -> Volume:
             f"{path}: a VTK file of type {header.kind or 'unknown'}; expected ImageData (.vti); resample it first "
             "(ParaView: Resample To Image)"
         )
-    infos = header.infos
-    info = infos[choose_array(infos, options.array, str(path))]
+    info = header.infos[choose_array(header.infos, options.array, str(path))]
     grid = image_grid(header.image, info.where, path)
     values = image_values(header, info, grid, options, path)
     place = options.spacing_or(grid.spacing), grid.origin, grid.direction
@@ -214,155 +255,83 @@ def time_value(path: Path) -> float | None:
     return float(times[0]) if len(times) == 1 else None
 
 
-def image_values(document: Scan, info: ArrayInfo, grid: Grid, options: ReadOptions, path: Path) -> np.ndarray:
+def image_values(header: Scan, info: ArrayInfo, grid: Grid, options: ReadOptions, path: Path) -> np.ndarray:
     """Read an image's array (nz, ny, nx), mapped where it is stored plainly; NaN where it is hidden.
 
-    With ``options.stored``, compressed ones stay in the file where they are appended and nothing is hidden. Errors are
-    those of `Reader.read`.
+    With ``options.stored``, compressed ones stay in the file. VTK reads what is text, in several pieces or partly
+    hidden. Errors are those of `Reader.read`.
     """
-    packed: np.ndarray | None = _packed(document, info, grid, options, path) if options.stored else None
-    if packed is not None:
-        return packed
-    component = select_from_array(_stored(document, info, grid, path), info, options.component, str(path))
-    for where in ("point", "cell"):
-        row = document.find(GHOSTS, where)
-        if row is None or (where == "point" and info.where == "cell") or row[0].components != 1:
-            continue
-        marks = _stored(document, row[0], image_grid(document.image, where, path), path)[..., 0]
-        hidden = marks.astype(np.uint8) & HIDDEN[where] != 0
-        component = without(component, hidden if where == info.where else around(hidden, component.shape))
-    return component
+    row = header.find(info.name, info.where)
+    form, compressor = row.attributes.get("format") if row else "", header.root.get("compressor", "")
+    whole = header.pieces == 1 and not any(header.find(GHOSTS, where) for where in HIDDEN)
+    if row is not None and whole and row.attributes["type"] != "Bit":
+        appended = form == "appended" and header.data_start >= 0
+        start = header.data_start + int(row.attributes.get("offset", "0"))
+        if appended and start < header.data_start:
+            raise DataError(f"{path}: array {info.name!r} begins before the appended data; is the file whole?")
+        if appended and header.appended == "raw" and not compressor:
+            stored = _mapped(header, info, grid, start, path)
+            return select_from_array(stored, info, options.component, str(path))
+        if compressor in _UNPACK and (form == "binary" or (appended and header.appended in ("raw", "base64"))):
+            start = start if appended else _text_of(path, row.position)
+            coded = not appended or header.appended == "base64"
+            packed: np.ndarray = packed_array(header, info, grid, start, coded, options, path)
+            return packed
+    values: np.ndarray = IMAGE_BY_VTK(path, replace(options, array=info.name or None, spacing=None)).data
+    return values
 
 
-def _stored(document: Scan, info: ArrayInfo, grid: Grid, path: Path) -> np.ndarray:
-    """Read the values (nz, ny, nx, c) of an array, mapped or by VTK."""
-    row = document.find(info.name, info.where)
+def _mapped(header: Scan, info: ArrayInfo, grid: Grid, start: int, path: Path) -> np.ndarray:
+    """Map an array (nz, ny, nx, c) that is stored plainly from byte ``start`` on."""
     shape = (*reversed(grid.dims), info.components)
-    _check_declared(document, info, count(shape), path)
-    check_memory(count(shape) * np.dtype(info.dtype).itemsize, str(path))
-    values = None if row is None else _mapped(document, row[1], info, shape, path)
-    return _by_vtk(path, info, shape) if values is None else values
-
-
-def without(values: np.ndarray, hidden: np.ndarray) -> np.ndarray:
-    """Set ``values`` to NaN where ``hidden``; return them as they are where nothing is."""
-    if not hidden.any():
-        return values
-    return np.where(hidden, np.nan, values).astype(float_dtype(values.dtype))
-
-
-def around(cells: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Mask the points (nz, ny, nx) whose surrounding cells are all in ``cells``, a mask."""
-    for axis, n in enumerate(shape):
-        if n > cells.shape[axis]:
-            ones = np.ones_like(np.take(cells, [0], axis))
-            cells = np.concatenate([ones, cells], axis) & np.concatenate([cells, ones], axis)
-    return cells
-
-
-def _check_declared(document: Scan, info: ArrayInfo, n_values: int, path: Path) -> None:
-    """Refuse sizes that the file cannot hold."""
-    need = n_values * np.dtype(info.dtype).itemsize
-    size = path.stat().st_size
-    if need > size * stored_ratio(document, path):
-        raise DataError(
-            f"{path}: {size_text(size)} cannot hold the {size_text(need)} of array {info.name!r} that its header "
-            "declares; check that the file is whole"
-        )
-    check_blocks(path, document.root, document.appended, document.data_start, stored_ratio(document, path))
-
-
-def _mapped(
-    document: Scan, attributes: dict[str, str], info: ArrayInfo, shape: tuple[int, ...], path: Path
-) -> np.ndarray | None:
-    """Map an array that is stored plainly, in one piece; None for others."""
-    plain = document.appended == "raw" and not document.root.get("compressor") and document.data_start >= 0
-    if not plain or document.pieces != 1 or attributes.get("format") != "appended" or attributes["type"] == "Bit":
-        return None
-    word, dtype = _order(document, info)
-    start = document.data_start + int(attributes.get("offset", "0"))
+    word, dtype = _order(header, info)
     declared = int(load_block(path, word, (1,), offset=start)[0])
-    if start < document.data_start or declared != count(shape) * dtype.itemsize:
+    if declared != count(shape) * dtype.itemsize:
         raise DataError(
             f"{path}: array {info.name!r} stores {declared} bytes, its header declares {count(shape) * dtype.itemsize}"
         )
     return load_block(path, dtype, shape, offset=start + word.itemsize)
 
 
-def _order(document: Scan, info: ArrayInfo) -> tuple[np.dtype, np.dtype]:
+def _order(header: Scan, info: ArrayInfo) -> tuple[np.dtype, np.dtype]:
     """Return the types of the words before an array's values and of the values, as stored."""
-    order = ">" if document.root.get("byte_order") == "BigEndian" else "<"
-    word = np.dtype(order + ("u8" if document.root.get("header_type") == "UInt64" else "u4"))
+    order = ">" if header.root.get("byte_order") == "BigEndian" else "<"
+    word = np.dtype(order + ("u8" if header.root.get("header_type") == "UInt64" else "u4"))
     return word, np.dtype(order + np.dtype(info.dtype).str[1:])
 
 
-def _packed(document: Scan, info: ArrayInfo, grid: Grid, options: ReadOptions, path: Path) -> Any:
-    """Wrap an array that is appended and compressed, in one piece, with no hidden value; None for others."""
-    row = document.find(info.name, info.where)
-    hidden = any(document.find(GHOSTS, where) for where in HIDDEN)
-    plain = not document.root.get("compressor") or document.appended not in ("raw", "base64") or document.data_start < 0
-    if row is None or plain or hidden or document.pieces != 1 or options.component == "magnitude":
-        return None
-    if row[1].get("format") != "appended" or row[1]["type"] == "Bit":
-        return None
-    shape = (*reversed(grid.dims), info.components)
-    _check_declared(document, info, count(shape), path)
-    start = document.data_start + int(row[1].get("offset", "0"))
-    if start < document.data_start:
-        raise DataError(f"{path}: array {info.name!r} begins before the appended data; check that the file is whole")
-    component = None if options.component is None else int(options.component)
-    word, dtype = _order(document, info)
-    return packed_array(
-        path, document.root["compressor"], word, document.appended == "base64", start, dtype, shape, component, info
-    )  # fmt: skip
+def block_table(path: Path, start: int, word: np.dtype, coded: bool) -> np.ndarray:
+    """Read the words before the blocks of an array from byte ``start`` on, those that are there."""
+    size = path.stat().st_size
+    with open(path, "rb") as file:
 
+        def words(n: int) -> np.ndarray:
+            file.seek(start)
+            data = file.read(4 * -(-n * word.itemsize // 3) if coded else n * word.itemsize)
+            try:
+                data = base64.b64decode(data, validate=True) if coded else data
+            except (binascii.Error, ValueError):  # damaged
+                data = b""
+            return np.frombuffer(data[: min(len(data) // word.itemsize, n) * word.itemsize], word)
 
-def _by_vtk(path: Path, info: ArrayInfo, shape: tuple[int, ...]) -> np.ndarray:
-    """Read values (nz, ny, nx, c) by vtkXMLImageDataReader, without a copy."""
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-    from vtkmodules.vtkIOXML import vtkXMLImageDataReader
-
-    with quiet_vtk() as message:
-        reader = vtkXMLImageDataReader()
-        reader.SetFileName(str(path))
-        reader.UpdateInformation()
-        for where, selection in (
-            ("point", reader.GetPointDataArraySelection()),
-            ("cell", reader.GetCellDataArraySelection()),
-        ):
-            selection.DisableAllArrays()
-            if where == info.where:
-                selection.EnableArray(info.name)
-        reader.Update()
-        image = reader.GetOutput()
-        data = image.GetPointData() if info.where == "point" else image.GetCellData()
-        array = data.GetArray(info.name) if info.name else data.GetArray(0)
-        checked(array, reader, message, path, f"array {info.name!r}")
-    values = vtk_to_numpy(array)
-    if values.size != count(shape):
-        raise DataError(f"{path}: array {info.name!r} has {values.size} values; expected {count(shape)}")
-    result: np.ndarray = values.reshape(shape)
-    return result
-
-
-LZMA_MEMORY = 1 << 28  # bytes of its dictionary
+        head = words(3)
+        return words(3 + int(head[0])) if len(head) == 3 and int(head[0]) <= size else head
 
 
 def packed_array(
-    path: Path, compressor: str, word: np.dtype, coded: bool, start: int, dtype: np.dtype, shape: tuple[int, ...],
-    component: int | None, info: ArrayInfo,
-) -> Stored:  # fmt: skip
-    """Wrap a component of an array that stays in its file.
+    header: Scan, info: ArrayInfo, grid: Grid, start: int, coded: bool, options: ReadOptions, path: Path
+) -> Any:
+    """Read a component (nz, ny, nx) of a compressed array, or leave it in its file.
 
-    ``compressor`` is as VTKFile names it, ``word`` the type of the words before the blocks, ``coded`` whether they are
-    in base64, ``start`` the byte of the first word, ``dtype`` that of the values as stored; ``shape`` is (nz, ny, nx,
-    components).
+    The first word before its blocks is at byte ``start``; ``coded``: all is in base64.
 
     Raises:
-        DataError: no whole table of blocks, or one of other sizes.
+        DataError: no whole table of blocks, or one of other sizes; a damaged block.
         UsageError: several components and none chosen.
     """
-    selected_dtype(info, component, str(path))  # raises where a component must be chosen
+    kind = selected_dtype(info, options.component, str(path))  # raises where a component must be chosen
+    word, dtype = _order(header, info)
+    shape = (*reversed(grid.dims), info.components)
     words = block_table(path, start, word, coded)
     sizes = np.array(words[3:], np.int64)
     need, blocks = count(shape) * dtype.itemsize, len(sizes)
@@ -374,10 +343,9 @@ def packed_array(
     begins = np.concatenate([[0], np.cumsum(sizes)])
     size = len(words) * word.itemsize
     place = start + (4 * -(-size // 3) if coded else size)
-    packed = _Blocks(path, compressor, coded, place, begins, each, need)
+    packed = _Blocks(path, _UNPACK[header.root["compressor"]], coded, place, begins, each, need)
     _, ny, nx, components = shape
     row = nx * components * dtype.itemsize
-    kind = dtype.newbyteorder("=")
 
     def read(slices: Slices) -> np.ndarray:
         z, y, x = slices
@@ -387,11 +355,28 @@ def packed_array(
             first = (k * ny + y.start) * row
             data = packed.read(first, first + (y.stop - y.start) * row, kept)
             values = np.frombuffer(data, dtype).reshape(y.stop - y.start, nx, components)
-            out[k - z.start] = values[:, x, component or 0]
+            if options.component == "magnitude":
+                out[k - z.start] = magnitude(np.moveaxis(values[None, :, x], -1, 0))[0]
+            else:
+                out[k - z.start] = values[:, x, int(options.component or 0)]
         return out
 
     rows = max(each // row, 1)
-    return Stored(read, kind, shape[:3], (max(rows // ny, 1), min(rows, ny), nx), str(path))
+    chunks = (max(rows // ny, 1), min(rows, ny), nx)
+    return stored_or_loaded(read, kind, shape[:3], chunks, str(path), options.stored)
+
+
+def _lz4(data: bytes, need: int) -> bytes:
+    import lz4.block
+
+    return bytes(lz4.block.decompress(data, uncompressed_size=need))
+
+
+_UNPACK: dict[str, Callable[[bytes, int], bytes]] = {
+    "vtkZLibDataCompressor": lambda data, need: zlib.decompressobj().decompress(data, need + 1),
+    "vtkLZ4DataCompressor": _lz4,
+    "vtkLZMADataCompressor": lambda data, need: lzma.LZMADecompressor(memlimit=LZMA_MEMORY).decompress(data, need + 1),
+}
 
 
 @dataclass(frozen=True)
@@ -400,7 +385,7 @@ class _Blocks:
 
     Attributes:
         path: the file.
-        compressor: as VTKFile names it.
+        unpack: unpacks a block, to few bytes more than the size that is given.
         coded: in base64.
         place: byte of the file where they begin.
         begins: (n + 1) packed bytes before each, and in all.
@@ -409,7 +394,7 @@ class _Blocks:
     """
 
     path: Path
-    compressor: str
+    unpack: Callable[[bytes, int], bytes]
     coded: bool
     place: int
     begins: np.ndarray
@@ -441,14 +426,7 @@ class _Blocks:
             return data[lo % 3 : lo % 3 + hi - lo]
 
     def _unpacked(self, data: bytes, need: int) -> bytes:
-        if self.compressor == "vtkLZ4DataCompressor":
-            import lz4.block
-
-            out: bytes = lz4.block.decompress(data, uncompressed_size=need)
-        elif self.compressor == "vtkLZMADataCompressor":
-            out = lzma.LZMADecompressor(memlimit=LZMA_MEMORY).decompress(data, need + 1)
-        else:
-            out = zlib.decompressobj().decompress(data, need + 1)
+        out = self.unpack(data, need)
         if len(out) != need:
             raise ValueError(f"a block of {len(out)} bytes where {need} are expected")
         return out
