@@ -1,11 +1,11 @@
-# make test | quick | lint | formats | docs | dist | bundle | figures | long | viewers | page | model | ci
+# make test | quick | lint | formats | docs | dist | bundle | figures | long | mutants | viewers | page | model | ci
 VENV ?= .venv-test
 PYTHON ?= python3
 BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 # CONSTRAINTS= installs the newest releases: for systems that the pins have no wheels for
 CONSTRAINTS ?= -c constraints.txt
 
-.PHONY: test quick lint format formats docs dist bundle figures long fuzz viewers page model ci
+.PHONY: test quick lint format formats docs dist bundle figures long fuzz mutants viewers page model ci
 
 $(BIN)/pytest: pyproject.toml constraints.txt
 	[ -x $(BIN)/python ] || $(PYTHON) -m venv $(VENV)
@@ -62,6 +62,10 @@ long: $(BIN)/pytest
 # 100,000 damaged files for every reader (part of `long`); what is found lies in out/fuzz.
 fuzz: $(BIN)/pytest
 	$(BIN)/python tests/fuzz.py --inputs 100000 --save out/fuzz
+
+# 200 single-token changes of the package, each of which a test should notice: about an hour on two cores.
+mutants: $(BIN)/pytest
+	$(BIN)/python tests/mutants.py --number 200
 
 # Files in web viewers (part of `long`): needs Chromium, node and npm; packages go to a cache folder.
 viewers: $(BIN)/pytest

@@ -1,14 +1,17 @@
 """A volume lit on a grid against paths traced from the eye: a CSV row a scene and sky.
 
-    PYTHONPATH=. python benchmarks/light_paths.py SCENES.tsv DATA_DIR TF_DIR --size 64 --paths 512 -o light-paths.csv
+    PYTHONPATH=. python benchmarks/light_paths.py SCENES.tsv DATA_DIR TF_DIR --size 64 --paths 4096 -o light-paths.csv
 
 `grid_db`: dB over RGB of the ray-cast view (test view 3, 3 x 3 rays a pixel) against the picture of paths; `noise_db`:
-of the latter, from its halves; `light_seconds`: processor time of the grid.
+of the latter, from its halves; `light_seconds`: processor time of the grid. Repeat `--paths` for a curve.
+With `--pictures DIR` no rows, but a JPEG a scene: unlit, under a headlight, and under the first sky.
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import click
@@ -27,8 +30,8 @@ def decibels(error: np.ndarray) -> float:
     return float(-10 * np.log10(np.mean(error[..., :3].astype(float) ** 2)))
 
 
-def measure(scene: Scene, name: str, size: int, paths: int) -> dict[str, Any]:
-    """One row."""
+def measure(scene: Scene, name: str, size: int, counts: tuple[int, ...]) -> Iterator[dict[str, Any]]:
+    """A row for each number of paths a pixel."""
     lighting = LightOptions((name,)).lighting(None, scene.volume.space)
     assert lighting is not None
     began = time.process_time()
@@ -36,29 +39,51 @@ def measure(scene: Scene, name: str, size: int, paths: int) -> dict[str, Any]:
     spent, camera = time.process_time() - began, default_views("test", size=size)[3]
     image = render_view(lit, camera, RenderSettings(samples=3))
     sky = sky_of(name, np.array(lighting.directions[0]), scene.volume.axes)
-    halves = [path_view(scene.scattering(), sky, scene.half, camera, paths // 2, seed) for seed in (1, 1 << 20)]
-    traced = (halves[0] + halves[1]) / 2
-    return {
-        "grid_db": decibels(image - traced),
-        "noise_db": decibels((halves[0] - halves[1]) / 2),
-        "light_seconds": spent,
-    }
+    for paths in counts:
+        halves = [path_view(scene.scattering(), sky, scene.half, camera, paths // 2, seed) for seed in (1, 1 << 20)]
+        traced = (halves[0] + halves[1]) / 2
+        noise = decibels((halves[0] - halves[1]) / 2)
+        yield {"paths": paths, "grid_db": decibels(image - traced), "noise_db": noise, "light_seconds": spent}
+
+
+def picture(scene: Scene, sky: str, size: int, target: Path) -> None:
+    """Draw test view 4 unlit, under a headlight, and under a sky whose viewer is the camera, side by side."""
+    from PIL import Image
+
+    camera = default_views("test", size=size)[4]
+    toward = scene.volume.axes @ camera.position
+    lights = [
+        LightOptions(names).lighting(None, None) for names in (("headlight",), (sky, f"{toward[0]},{toward[1]},0"))
+    ]
+    lit = [scene, *(scene.lit(light) for light in lights if light)]
+    sheet = np.hstack([render_view(one, camera, RenderSettings(samples=3))[..., :3] for one in lit])
+    Image.fromarray(np.rint(255 * sheet.clip(0, 1)).astype(np.uint8)).save(target, quality=88)
 
 
 @click.command(help=__doc__)
 @click.argument("places", nargs=3, type=click.Path(exists=True))
 @click.option("--scene", "scenes", multiple=True)
 @click.option("--size", type=int, default=64)
-@click.option("--paths", type=int, default=512)
+@click.option("--sky", "skies", multiple=True, default=SKIES)
+@click.option("--paths", type=int, multiple=True, default=(512,))
 @click.option("-o", "--output", type=click.Path())
-def main(places: tuple[str, str, str], scenes: tuple[str, ...], size: int, paths: int, output: str | None) -> None:
-    rows = []
+@click.option("--pictures", type=click.Path(file_okay=False))
+def main(
+    places: tuple[str, str, str], scenes: tuple[str, ...], size: int, skies: tuple[str, ...], paths: tuple[int, ...],
+    output: str | None, pictures: str | None,
+) -> None:  # fmt: skip
+    rows: list[dict[str, Any]] = []
     for name, source in read_scenes(*places, scenes or None):
-        for sky in SKIES:
-            row = {"scene": name, "sky": sky, **measure(source.scene(), sky, size, paths), "size": size, "paths": paths}
-            rows.append({**row, "commit": commit(), "machine": machine().split(", load")[0]})
-            print(rows[-1], flush=True)
-    write_rows(output, rows)
+        if pictures:
+            picture(source.scene(), skies[0], size, Path(pictures) / f"{name}-{skies[0]}.jpg")
+            continue
+        for sky in skies:
+            for row in measure(source.scene(), sky, size, paths):
+                rows.append({"scene": name, "sky": sky, **row, "size": size, "commit": commit()})
+                rows[-1]["machine"] = machine().split(", load")[0]
+                print(rows[-1], flush=True)
+    if rows:
+        write_rows(output, rows)
 
 
 if __name__ == "__main__":

@@ -50,7 +50,7 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_collection_finish(session: pytest.Session) -> None:
     """Compile kernels on all cores, before the tests ask for them one by one."""
     parallel = hasattr(session.config, "workerinput")  # of pytest-xdist, whose first process has compiled them
-    wanted = os.environ.get("KERNELS_AHEAD") != "0"
+    wanted = os.environ.get("KERNELS_AHEAD") != "0"  # tests/mutants.py: a mutant's are compiled as they are asked for
     if wanted and len(session.items) > 20 and not session.config.getoption("collectonly") and not parallel:
         compile_kernels()
 

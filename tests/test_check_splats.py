@@ -76,7 +76,7 @@ def test_a_conversion_passes_with_and_without_its_volume(vvgt, made, scene):
 
 
 def test_light_without_a_volume_is_refused(vvgt, made):
-    for line, text in ((("--light", "headlight"), "--light"), ((made, "--ambient-occlusion"), "--ambient-occlusion")):
+    for line, text in ((("--light", "headlight"), "--light"), ((made, "--specular-power", 5), "--specular-power")):
         found = vvgt("check", *line)
         assert (found.code, found.error.startswith(f"vvgt: error: {text}: only with a volume")) == (2, True), (
             found.error

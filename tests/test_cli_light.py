@@ -60,12 +60,9 @@ def test_a_lit_file_says_its_light_and_is_judged_under_it(folder, vvgt):
 
 def test_light_that_does_not_depend_on_the_view_needs_no_harmonics(folder, vvgt):
     out = folder / "fixed.ply"
-    lit = "--light 1,0,2 --shadows --specular 0 --ambient-occlusion"
-    vvgt.ok("convert", SOURCE, *tf(folder), *SMALL, lit, "-o", out)
+    vvgt.ok("convert", SOURCE, *tf(folder), *SMALL, "--light 1,0,2 --specular 0", "-o", out)
     gaussians, header = read_ply(out)
     assert (gaussians.harmonics, header.sh_degree) == (None, 0)
-    assert header.light.shadows
-    assert header.light.occlusion == 0.1
     dark = folder / "dark.ply"
     vvgt.ok("convert", SOURCE, *tf(folder), *SMALL, "-o", dark)
     assert read_ply(dark)[1].light is None
@@ -100,7 +97,6 @@ def test_what_cannot_be_is_refused_before_the_work(folder, vvgt):
         (("--light", "0,0,0"), "--light 0,0,0: its length is 0"),
         (("--specular", "0.5"), "--specular: there is no light"),
         (("--light", "headlight", "--ambient", "nan"), "--ambient nan"),
-        (("--light", "headlight", "--shadows"), "--shadows: a headlight casts no visible shadows"),
     ):
         assert message in vvgt.fails(2, "convert", SOURCE, *tf(folder), *options, "-o", folder / "no.ply")
         assert not (folder / "no.ply").exists()
@@ -115,7 +111,7 @@ def test_the_library_takes_names_directions_and_options():
     assert by_name.normals().shape == by_name.gaussians.means.shape
     by_direction = vvgt_cli.convert(SOURCE, Look(function, light=(0, 0, 1)), **few)
     assert by_direction.field.source.lighting == Lighting(False, ((0, 0, 1),))
-    options = LightOptions(("above", "headlight"), shadows=True, specular=0)
+    options = LightOptions(("above", "headlight"), specular=0)
     _, images = vvgt_cli.render_views(SOURCE, Look(function, light=options), views=1, size=32)
     _, dark = vvgt_cli.render_views(SOURCE, function, views=1, size=32)
     assert np.abs(images - dark).max() > 0.05

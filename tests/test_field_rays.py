@@ -32,7 +32,7 @@ from vvgt_cli.volume import Volume
 
 ENDS = np.array([0.0, 120.0, 121.0, 255.0])
 STEEP = TransferFunction("step", PiecewiseOpacity(ENDS, np.array([0.0, 0, 1, 1])), ColorMap(ENDS, np.ones((4, 3))))
-LIT = LightOptions(lights=("1,1,2", "headlight"), shadows=True, occlusion=0.2)
+LIT = LightOptions(lights=("1,1,2", "headlight"), diffuse=0.5)
 
 
 def volume_of(dims, spacing=(1.0, 1.0, 1.0)):

@@ -20,7 +20,7 @@ from vvgt_cli.splat import render
 from vvgt_cli.volume import Volume, shapes
 
 FINE = RenderSettings(step=0.0625, samples=1)
-LIT = Lighting(headlight=True, directions=((0.6, -0.48, 0.64),), shadows=True, occlusion=0.2)
+LIT = Lighting(headlight=True, directions=((0.6, -0.48, 0.64),))
 
 
 @dataclass(frozen=True)

@@ -217,12 +217,11 @@ def test_commands_need_what_is_compiled_ahead_and_nothing_else(tmp_path, spied):
     labels = wanted("convert", "seg.npy", *fit, "--steps", 24, "-o", "g.ply")
     grid = ahead.for_grid(ahead.for_light(ahead.CONVERT, False))
     assert labels == set(ahead.for_degree(grid, 2)) - {*ahead.REGRESS, ahead.MIX}  # of other grids, and of more
-    wanted("convert", "seg.npy", *fit, "--steps", 24, "--light", "above", "--shadows", "--blocks", 16, "-o", "h.ply")
+    wanted("convert", "seg.npy", *fit, "--steps", 24, "--light", "sun", "--blocks", 16, "-o", "h.ply")
     live = wanted("convert", SOURCE, *fit, "--live", "-o", "l.ply")
     assert {*ahead.LIVE, *ahead.VOXELIZE} <= live
     assert wanted("voxelize", "l.ply", "-qo", "l.nrrd") == set(ahead.VOXELIZE)
-    dark = ("--light", "above", "--shadows", "--specular", 0)
-    flat = wanted("convert", SOURCE, *fit, "--steps", 24, *dark, "-o", "f.ply")
+    flat = wanted("convert", SOURCE, *fit, "--steps", 24, "--light", "sun", "-o", "f.ply")
     assert flat == set(ahead.for_light(ahead.CONVERT, True)) - rare
 
 

@@ -79,7 +79,7 @@ ROWS = {  # name: (volume, options); all of `convert`, to one .ply
             "playcanvas",
         ),
     ),
-    "shadows": ("scalars.nii", ("--tf", "tf.json", "--light", "above", "--shadows", "--ambient-occlusion", "0.3")),
+    "sky": ("scalars.nii", ("--tf", "tf.json", "--light", "sun")),
     "colours in the world": ("rgb.tif", ("--target-psnr", "35", "--frame", "world", "--up", "z")),
     "layers, lit": ("scalars.nii", ("--tf", "tf.json", "--layer", "labels.nii,labels=auto", "--light", "above")),
     "wavelet, lit, of a time step": (
@@ -108,7 +108,7 @@ def test_memory_and_blocks_of_any_size_agree(vvgt, at, tmp_path, row):
     assert [stage["name"] for stage in memory["stages"] if stage["name"] not in ("scene", "compile")] == [
         stage["name"] for stage in blocks["stages"] if stage["name"] != "compile"
     ]
-    more = ("--workers", "2") if row == "shadows" else ()
+    more = ("--workers", "2") if row == "sky" else ()
     converted(vvgt, *ROWS[row], tmp_path / "32.ply", "--blocks", "32", *more)
     assert (tmp_path / "16.ply").read_bytes() == (tmp_path / "32.ply").read_bytes()
     assert not [path for path in tmp_path.iterdir() if path.suffix not in (".ply", ".json")]

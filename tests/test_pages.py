@@ -192,7 +192,7 @@ def test_the_page_of_one_volume_holds_its_values_and_look_unless_it_cannot(vvgt,
     assert both["values"][0]["dims"] == [12, 11, 10]
     vvgt.ok("convert", tmp_path / "v.npy", "-o", tmp_path / "v.ply", *HOW)
     assert same(np.sort(read_splats(tmp_path / "a.html")[0].opacity_logits), tmp_path / "v.ply")
-    assert {"look", "values"} <= set(scene("v.npy", "--light", "1,0,0", "--shadows", "--time-budget", "5"))
+    assert {"look", "values"} <= set(scene("v.npy", "--light", "1,0,0", "--time-budget", "5"))
     assert not {"look", "values"} & set(scene("v.npy", "--no-values"))
     assert not {"look", "values"} & set(scene("rgb.npy", "--component", "color"))
     np.save(tmp_path / "many.npy", np.arange(512, dtype=np.uint16).reshape(8, 8, 8))

@@ -303,7 +303,7 @@ def test_a_frame_that_shows_something_else_is_converted_by_itself(vvgt, beat):
 
 @pytest.mark.parametrize(
     "more",
-    [("--shard", "1/1"), ("--light", "above", "--shadows")],
+    [("--shard", "1/1"), ("--light", "sun")],
     ids=lambda more: more[0],
 )
 def test_what_cannot_go_on_is_converted_frame_by_frame(vvgt, beat, more):

@@ -115,7 +115,7 @@ def test_a_damaged_part_is_a_line(vvgt, raw, tmp_path):
 def test_dasks_workers_convert_labels_under_light(vvgt, tmp_path):
     pytest.importorskip("distributed")
     np.save(tmp_path / "v.npy", np.digitize(bodies((70, 30, 25)), [0.2, 0.6]).astype(np.uint8))
-    how = ("--labels", "auto", "--light", "above", "--shadows", "--max-gaussians", 300, "--screen", 48, "--steps", 6)
+    how = ("--labels", "auto", "--light", "sun", "--max-gaussians", 300, "--screen", 48, "--steps", 6)
     line = ("convert", tmp_path / "v.npy", *how, "--blocks", 32, "-o")
     vvgt.ok(*line, tmp_path / "one.ply", "-q")
     run = start(*line, tmp_path / "two.ply", "--workers", 2, "--scheduler", "local")

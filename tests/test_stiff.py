@@ -43,7 +43,7 @@ from vvgt_cli.splat import render
 
 STIFF = SCALARS | GRIDS
 LIT = [name for name in SCALARS if name not in {f"type {kind}" for kind in TYPES}]
-EVERYTHING = Lighting(True, ((0.6, -0.48, 0.64), (0.0, 0.0, 1.0)), shadows=True, occlusion=0.2)
+EVERYTHING = Lighting(True, ((0.6, -0.48, 0.64), (0.0, 0.0, 1.0)))
 SIZE = 64
 STIFFEST = (  # for every change; the others are long
     "depth 1e+06 a voxel", "shell of a thousandth", "spacing (1.0, 1.0, 1000.0)", "values of 1e+300", "a block of nan",
@@ -136,7 +136,7 @@ def test_views_match_the_twin_and_long_steps_stay_bounded(name):
 
 @scenes(LIT)
 def test_lit_views_match_the_twin_and_lit_gaussians_are_finite(name):
-    """Under a headlight; every third also under two more lights with shadows and occlusion."""
+    """Under a headlight; every third also under two more lights."""
     stiff, at = SCALARS[name], LIT.index(name)
     for lighting in (Lighting(), EVERYTHING)[: 1 + (at % 3 == 0)]:  # shading is that of the middle of a step
         lit = stiff.make().lit(lighting)

@@ -20,7 +20,7 @@ from vvgt_cli.score.record import ConversionReport, Run
 FIT = ("--max-gaussians", "9000", "--screen", "150", "--up", "z", "-q")
 LIGHTS = {
     "head": ("--light", "headlight"),
-    "shadows": ("--light", "1,0.3,2", "--shadows", "--ambient-occlusion", "0.3"),
+    "fixed": ("--light", "1,0.3,2"),
 }
 
 
@@ -41,7 +41,7 @@ def nearest(found: Gaussians, expected: Gaussians) -> tuple[np.ndarray, np.ndarr
     return near[same], rows[same]
 
 
-@pytest.mark.parametrize("light", [pytest.param("head", marks=pytest.mark.long), "shadows"])
+@pytest.mark.parametrize("light", [pytest.param("head", marks=pytest.mark.long), "fixed"])
 def test_levels_are_lit_as_the_closed_form_in_memory(vvgt, volume: Path, tmp_path: Path, light: str) -> None:
     out = tmp_path / "out" / "lod-meta.json"
     vvgt.ok("init", volume, *FIT, *LIGHTS[light], "--blocks", "32", "-o", out)
@@ -58,7 +58,7 @@ def test_levels_are_lit_as_the_closed_form_in_memory(vvgt, volume: Path, tmp_pat
 
 
 def test_merged_shards_have_the_bytes_of_one_run(vvgt, tmp_path: Path) -> None:
-    volume, lit = tmp_path / "v_64x48x60_uint8.raw", LIGHTS["shadows"]
+    volume, lit = tmp_path / "v_64x48x60_uint8.raw", LIGHTS["fixed"]
     volume.write_bytes(np.round(bodies((64, 48, 60)) * 255).astype(np.uint8).tobytes())
     for blocks in ("32", "64"):
         vvgt.ok("init", volume, *FIT, *lit, "--blocks", blocks, "-o", tmp_path / f"{blocks}.ply")

@@ -17,17 +17,17 @@ import numpy as np
 from vvgt_cli.closed_form.columns import COLOR, COLUMNS, FIRST, MASS, RED, SEEN, SEEN_COLOR, SEEN_RED, X, Y, Z
 from vvgt_cli.closed_form.tree import Leaves, Tree
 from vvgt_cli.dvr.kernel import FLAGS, mean_optics, sample, table_coordinate
-from vvgt_cli.dvr.layout import LIT, TRACED, Light, Optics, Voxels
+from vvgt_cli.dvr.layout import LIT, Light, Optics, Voxels
 from vvgt_cli.dvr.light import sphere
 from vvgt_cli.dvr.scene import Scene
-from vvgt_cli.dvr.shading import arrives, fixed_diffuse, normal, openness, shade_at
+from vvgt_cli.dvr.shading import fixed_diffuse, normal, shade_at
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.frames import C2, axes_of, basis
 from vvgt_cli.gaussians.types import HARMONICS, SH_C0
 from vvgt_cli.jit.decorators import parallel_kernel
 from vvgt_cli.jit.threads import ThreadSlice, iterations
 
-NORMALS, TINT, FIXED, MEAN, ARRIVING = slice(1, 7), slice(7, 10), slice(10, 13), slice(13, 16), 16
+NORMALS, TINT, FIXED, MEAN, SUMS = slice(1, 7), slice(7, 10), slice(10, 13), slice(13, 16), 16
 SEEN_LITTLE = 1e-12  # of the mass: all of it counts where the cameras see no more
 AROUND = 96  # directions that highlights are projected on
 CHUNK = 1 << 14  # Gaussians whose highlights are projected at once
@@ -61,11 +61,10 @@ def _shade(
     step: np.ndarray,
     out: np.ndarray,
 ) -> None:
-    """Write sums over rows ``first[k]`` to ``last[k]`` of ``moments`` (n, 18) into ``out`` (k, 16 + lights).
+    """Write sums over rows ``first[k]`` to ``last[k]`` of ``moments`` (n, 18) into ``out`` (k, 16).
 
-    Weight (what is seen), times n n^T (xx, xy, xz, yy, yz, zz), colour where it is open, colour without what depends on
-    the view, times n, and what arrives of each light. ``normals`` (n, 3) at the rows' centroids; ``half``, ``step``
-    (3,) of `Scene`.
+    Weight (what is seen), times n n^T (xx, xy, xz, yy, yz, zz), colour, colour without what depends on the view, and
+    times n. ``normals`` (n, 3) at the rows' centroids; ``half``, ``step`` (3,) of `Scene`.
     """
     for k in iterations(thread, len(first)):
         row = out[k]
@@ -81,18 +80,16 @@ def _shade(
             w = cell[shift]
             if not w > 0.0:
                 continue
-            x = (cell[X] / cell[MASS] + half[0]) / step[0] - 0.5
-            y = (cell[Y] / cell[MASS] + half[1]) / step[1] - 0.5
-            z = (cell[Z] / cell[MASS] + half[2]) / step[2] - 0.5
-            n0, n1, n2 = normals[m, 0], normals[m, 1], normals[m, 2]
-            if light.shadows == TRACED:
-                row[0] += w
+            row[0] += w
+            if light.traced:
+                x = (cell[X] / cell[MASS] + half[0]) / step[0] - 0.5
+                y = (cell[Y] / cell[MASS] + half[1]) / step[1] - 0.5
+                z = (cell[Z] / cell[MASS] + half[2]) / step[2] - 0.5
                 for c in range(3):
                     row[10 + c] += shade_at(light, c, x, y, z) * cell[color + c]
                 continue
-            open_ = openness(light, x, y, z)
-            factor = open_ * (light.ambient + light.diffuse * fixed_diffuse(light, n0, n1, n2, x, y, z))
-            row[0] += w
+            n0, n1, n2 = normals[m, 0], normals[m, 1], normals[m, 2]
+            factor = light.ambient + light.diffuse * fixed_diffuse(light, n0, n1, n2)
             row[1] += w * n0 * n0
             row[2] += w * n0 * n1
             row[3] += w * n0 * n2
@@ -100,13 +97,11 @@ def _shade(
             row[5] += w * n1 * n2
             row[6] += w * n2 * n2
             for c in range(3):
-                row[7 + c] += open_ * cell[color + c]
+                row[7 + c] += cell[color + c]
                 row[10 + c] += factor * cell[color + c]
             row[13] += w * n0
             row[14] += w * n1
             row[15] += w * n2
-            for which in range(light.directions.shape[0]):
-                row[16 + which] += w * arrives(light, which, x, y, z)
 
 
 @dataclass(frozen=True)
@@ -133,12 +128,12 @@ class Shading:
         return cls(scene.light, scene.half, scene.step, lambda points: at_points(scene, points)[:, :3])
 
     def lit(self, tree: Tree, leaves: Leaves, base: np.ndarray) -> np.ndarray:
-        """Return the means (k, 16 + lights) of `sums` over the base cells of ``leaves``.
+        """Return the means (k, 16) of `sums` over the base cells of ``leaves``.
 
         ``base`` (n, 3): normals at the centroids of the tree's base cells.
         """
         inside = leaves.node >= 0  # others lie below the tree's base: a row of their own
-        means = np.empty((len(leaves), ARRIVING + len(self.light.directions)))
+        means = np.empty((len(leaves), SUMS))
         means[inside] = self.sums(tree.moments, base, *base_rows(tree, leaves.node[inside]))
         below = leaves.moments[~inside]
         if len(below):
@@ -154,10 +149,10 @@ class Shading:
     def sums(
         self, rows: np.ndarray, normals: np.ndarray, first: np.ndarray | None = None, last: np.ndarray | None = None
     ) -> np.ndarray:
-        """Return `_shade` of each row, or of rows ``first`` to ``last``, over the weight: means (k, 16 + lights)."""
+        """Return `_shade` of each row, or of rows ``first`` to ``last``, over the weight: means (k, 16)."""
         if first is None or last is None:
             first, last = np.arange(len(rows)), np.arange(1, len(rows) + 1)
-        out = np.empty((len(first), ARRIVING + len(self.light.directions)))
+        out = np.empty((len(first), SUMS))
         normals, rows = np.ascontiguousarray(normals), np.ascontiguousarray(rows)
         _shade(self.light, normals, rows, first, last, self.half, self.step, out)
         out /= np.maximum(out[:, :1], np.finfo(np.float64).tiny)
@@ -223,7 +218,7 @@ def base_rows(tree: Tree, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def colored(gaussians: Gaussians, light: Light, out: np.ndarray, degree: int) -> Gaussians:
-    """Colour Gaussians by the means ``out`` (K, 16 + lights) of `Shading.sums`."""
+    """Colour Gaussians by the means ``out`` (K, 16) of `Shading.sums`."""
     colors, terms = out[:, FIXED].copy(), np.zeros((len(out), HARMONICS[degree], 3))
     normals = out[:, NORMALS][:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)  # of xx, xy, xz, yy, yz, zz
     white = np.ones((1, 3))
@@ -234,7 +229,7 @@ def colored(gaussians: Gaussians, light: Light, out: np.ndarray, degree: int) ->
             if degree >= 2:
                 terms[:, 3:8] += factor * across[:, :, None] * tint[:, None, :]
     if light.specular > 0 and len(light.directions):
-        mean, all_terms = highlights(normals, light.directions, out[:, ARRIVING:], light.power, degree)
+        mean, all_terms = highlights(normals, light.directions, light.power, degree)
         colors += light.specular * mean[:, None]
         terms += light.specular * all_terms[:, :, None]
     return replace(gaussians, colors=np.clip(colors, 0, BRIGHTEST), harmonics=terms if degree else None)
@@ -257,15 +252,12 @@ def even(normals: np.ndarray, power: float, degree: int) -> tuple[np.ndarray, np
     return trace * (at_zero + square / 3), np.stack(across, axis=1)
 
 
-def highlights(
-    normals: np.ndarray, directions: np.ndarray, arriving: np.ndarray, power: float, degree: int
-) -> tuple[np.ndarray, np.ndarray]:
+def highlights(normals: np.ndarray, directions: np.ndarray, power: float, degree: int) -> tuple[np.ndarray, np.ndarray]:
     """Return mean over directions (n,) and coefficients (n, M) of the highlights of lights at infinity.
 
     Args:
         normals: (n, 3, 3) means of n n^T.
         directions: (lights, 3) unit vectors towards the lights.
-        arriving: (n, lights) share of each light that arrives.
         power: of abs(n . h).
         degree: of the harmonics.
     """
@@ -279,6 +271,5 @@ def highlights(
         main = np.linalg.eigh(normals[part])[1][:, :, 2]
         trace = np.trace(normals[part], axis1=1, axis2=2)
         for k in range(len(directions)):
-            weight = (trace * arriving[part, k])[:, None]
-            harmonics[part] += weight * (np.minimum(np.abs(main @ half[k].T), 1) ** power @ projected)
+            harmonics[part] += trace[:, None] * (np.minimum(np.abs(main @ half[k].T), 1) ** power @ projected)
     return harmonics[:, 0] * SH_C0, harmonics[:, 1:]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vvgt_cli.closed_form.lit import ARRIVING, FIXED, NORMALS, TINT, colored
+from vvgt_cli.closed_form.lit import FIXED, NORMALS, SUMS, TINT, colored
 from vvgt_cli.dvr.light import scene_light
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.look.lighting import Lighting
@@ -13,7 +13,7 @@ DEGREE = 2  # of harmonics under a light that depends on the view
 
 
 def relight(gaussians: Gaussians, axis: np.ndarray, lighting: Lighting) -> Gaussians:
-    """Colour Gaussians under a light, without shadows or occlusion.
+    """Colour Gaussians under a light that is no sky.
 
     Args:
         gaussians: of one colour each.
@@ -21,10 +21,10 @@ def relight(gaussians: Gaussians, axis: np.ndarray, lighting: Lighting) -> Gauss
             a normal along it, the rest normals in all directions; zeros where there are none: ambient light only.
         lighting: directions in the same frame.
     """
-    light = scene_light(lighting, np.eye(3), np.ones(3), (1, 1, 1), _unattenuated)
+    light = scene_light(lighting, np.eye(3), np.ones(3), (1, 1, 1))
     share = np.linalg.norm(axis.astype(np.float64), axis=1)
     normals, rest = axis / np.maximum(share, 1e-30)[:, None], np.where(share > 0, 1 - share, 0)
-    sums = np.zeros((len(gaussians), ARRIVING + len(light.directions)))
+    sums = np.zeros((len(gaussians), SUMS))
     sums[:, 0] = 1
     sums[:, NORMALS] = share[:, None] * normals[:, [0, 0, 0, 1, 1, 2]] * normals[:, [0, 1, 2, 1, 2, 2]]
     sums[:, TINT] = gaussians.colors
@@ -32,9 +32,4 @@ def relight(gaussians: Gaussians, axis: np.ndarray, lighting: Lighting) -> Gauss
     diffuse = share * np.abs(normals @ light.directions.T).sum(axis=1) + rest * lights / 2
     sums[:, FIXED] = gaussians.colors * (light.ambient + light.diffuse * diffuse)[:, None]
     sums[:, FIXED] += (light.specular * lights * mean * rest)[:, None]
-    sums[:, ARRIVING:] = 1
     return colored(gaussians, light, sums, DEGREE if lighting.depends_on_view else 0)
-
-
-def _unattenuated(cell: int) -> np.ndarray:
-    raise AssertionError("no shadows, no occlusion")

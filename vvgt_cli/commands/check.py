@@ -91,11 +91,10 @@ def command(file: str | None, volume: str | None, as_json: bool, **options: Any)
     """
     from vvgt_cli.gaussians.formats import is_splats
 
-    flags = {"lights": "light", "occlusion": "ambient-occlusion"}
     asked = options["optics"] | options["read"] | options["light"]
     given = [key for key, value in asked.items() if value and (key, value) != ("tf_range", "data")]
     if given and volume is None and (file is None or is_splats(file)):
-        names = ", ".join(f"--{flags.get(key, key).replace('_', '-')}" for key in given)
+        names = ", ".join(f"--{'light' if key == 'lights' else key.replace('_', '-')}" for key in given)
         raise UsageError(f"{names}: only with a volume; expected {'--volume' if file else 'VOLUME'} too")
     report = check(file, volume=volume, **shared.arguments(**options))
     click.echo(report.to_json() if as_json else report.table(), nl=False)

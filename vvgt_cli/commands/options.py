@@ -160,12 +160,13 @@ output_option = click.option(
     "-o", "--output", required=True, metavar="OUT.ply",
     help="Output file; its ending selects the format, - is standard output.",
 )  # fmt: skip
-_LIGHT = dict(
+light_options = group(
+    "light",
     lights=click.option(
         "--light", "lights", multiple=True, metavar="none|headlight|studio|X,Y,Z|left|...",
         help="Light at the eye ('headlight') or from a direction in the world: X,Y,Z, an axis (x, -x, ...), above, "
         "below, left, right, anterior, ... Repeatable. Or light from all around, traced along its paths: studio, "
-        "overcast, window, or a picture, FILE.hdr or .exr. Default: a headlight if the function has one, as "
+        "overcast, window, sun, or a picture, FILE.hdr or .exr. Default: a headlight if the function has one, as "
         "presets such as ct-bone and label maps do, else none.",
     ),
     ambient=click.option(
@@ -186,16 +187,6 @@ _LIGHT = dict(
 layer_looks_option = click.option(
     "--layer", "layers", multiple=True, metavar="LAYER,tf=TF",
     help="Function (tf=) or table (labels=) of one layer or channel of several, by number or name; repeat for others.",
-)  # fmt: skip
-relight_options = group("light", **_LIGHT)
-light_options = group(
-    "light",
-    **_LIGHT,
-    shadows=click.option("--shadows", is_flag=True, help="Let directional lights cast soft shadows."),
-    occlusion=click.option(
-        "--ambient-occlusion", "occlusion", type=float, is_flag=False, flag_value=0.1, metavar="[RADIUS]",
-        help="Darken crevices within RADIUS, where the volume's longest edge is 2. RADIUS is 0.1 if omitted.",
-    ),
 )  # fmt: skip
 
 SECONDS = {"": 1.0, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}

@@ -88,7 +88,7 @@ def recolor(
 @shared.layer_looks_option
 @shared.tf_range_option
 @shared.unit_distance_option
-@shared.relight_options
+@shared.light_options
 @shared.overwrite_option
 @shared.common_options
 def command(console: Console, **options: Any) -> None:

@@ -128,7 +128,7 @@ def _anonymous(name: str, value: str) -> str:
 
 SECTIONS = {  # parameters by name, in the order shown; all others come first, under "Options"
     "Input": "dims dtype byte_order header_bytes spacing space array component time suv crop mask keep_largest",
-    "Look": "iso tf_range opacity_unit_distance labels layers ambient diffuse specular specular_power occlusion",
+    "Look": "iso tf_range opacity_unit_distance labels layers ambient diffuse specular specular_power",
     "Quality": "steps init model rule seed renderer samples step",
     "Output": "frame up camera sh_degree comments split_labels values story format half background points report "
     "conditions",

@@ -65,8 +65,6 @@ def check_live(request: ConvertRequest) -> None:
         "--checkpoint": request.checkpoint is not None,
         "--sh-degree": request.ply.sh_degree is not None,
         "--no-comments": not request.ply.comments,
-        "--shadows": light.shadows,
-        "--ambient-occlusion": light.occlusion is not None,
         f"--light {' '.join(light.lights)}": any(map(is_sky, light.lights)),
     }
     if names := [name for name, there in given.items() if there]:

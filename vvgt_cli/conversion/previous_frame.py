@@ -96,7 +96,7 @@ class PreviousFrame(WarmStart):
         self._moved = None
         last, self._last = self._last, None
         lighting = work.field.source.lighting
-        if last is None or (lighting is not None and lighting.attenuated):  # shadows reach far
+        if last is None or (lighting is not None and lighting.sky is not None):  # shadows reach far
             self._pictures.invalidate(None)
             return ""
         with work.run.stage("differences") as stage:

@@ -59,8 +59,8 @@ class PreviousLook(WarmStart):
         sources, refinement = (before.source, field.source), self.earlier.report.refinement
         if any(source.gridded for source in sources):
             return "labels, channels or layers"
-        if any(source.lighting is not None and source.lighting.attenuated for source in sources):
-            return "shadows or occlusion"
+        if any(source.lighting is not None and source.lighting.sky is not None for source in sources):
+            return "a sky"
         if {work.degree, self.earlier.gaussians.degree} - {0, 2}:
             return "harmonics of another degree than 2"
         if refinement is None or request.fit.steps == 0 or request.fit.model is not None:

@@ -252,14 +252,11 @@ def light_of(asked: LightOptions, preset: Lighting | None, space: str | None) ->
     """Return the light on live Gaussians, None for none.
 
     Raises:
-        UsageError: invalid lights; skies, shadows or occlusion, which need the volume.
+        UsageError: invalid lights; skies, which need the volume.
     """
     lighting = asked.lighting(preset, space if space in ("RAS", "LPS") else None)
-    if lighting is not None and lighting.attenuated:
-        raise UsageError(
-            "skies, --shadows and --ambient-occlusion need the volume, which live Gaussians are shown without; remove "
-            "them"
-        )
+    if lighting is not None and lighting.sky is not None:
+        raise UsageError(f"--light {lighting.sky}: skies need the volume, which live Gaussians are shown without")
     return lighting
 
 

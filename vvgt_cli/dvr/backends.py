@@ -23,7 +23,7 @@ def view_renderer(
 
     Args:
         renderer: ``vvgt`` (on the scene's device) or ``vtk`` (VTK's own picture).
-        scene: the volume under its function, and its light: ``vtk`` knows of none that is attenuated.
+        scene: the volume under its function, and its light: ``vtk`` knows of no sky.
         settings: step and rays a pixel; VTK takes the step and shoots one ray a pixel.
 
     Raises:
@@ -37,10 +37,8 @@ def view_renderer(
         return lambda camera: render_view(scene, camera, settings)
     if scene.grid is not None:
         raise UsageError(f"the vtk renderer draws one volume under a function; of {scene.tf.name} try vvgt")
-    if scene.light is not None and (scene.light.shadows or scene.light.occlusion):
-        raise UsageError(
-            "the vtk renderer has neither our shadows nor our ambient occlusion and skies; use the vvgt renderer"
-        )
+    if scene.light is not None and scene.light.traced:
+        raise UsageError("the vtk renderer has no skies; use the vvgt renderer")
     from vvgt_cli.dvr import vtk
 
     return vtk.view_renderer(scene, settings)

@@ -12,7 +12,6 @@ from vvgt_cli.look.tables import Optics as Optics  # kernels' modules have all t
 
 BRICK_BITS = 3
 BRICK = 1 << BRICK_BITS  # voxels along the edge of a brick of the empty-space map
-TRACED = 2  # `Light.shadows` where light was traced along paths
 TYPES = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))  # of values that kernels read
 
 
@@ -94,10 +93,9 @@ class Light(NamedTuple):
         ambient, diffuse, specular, power: coefficients; ``power`` is of the highlight.
         head: 1 with a light at the eye, else 0.
         directions: (n, 3) float64 unit vectors towards lights at infinity, (x, y, z).
-        shade: (m, cz, cy, cx) float32 in [0, 1] at the centres of cubes of voxels: the transmittance towards each
-            light where there are shadows (then m >= n), and last how open each place is where there is occlusion; or
-            the red, green and blue that arrive from a sky, which may be above 1.
-        shadows, occlusion: 1 where ``shade`` has them, else 0; shadows `TRACED` where it has red, green and blue.
+        shade: (3, cz, cy, cx) float32 at the centres of cubes of voxels: red, green and blue that arrive from a sky,
+            which may be above 1.
+        traced: 1 where ``shade`` is all the light, 0 where it is none of it.
         inv_cell: cells of ``shade`` a voxel.
         edge: (3,) float64 voxel edges, unit-frame lengths, (x, y, z).
         origin: (3,) float64 voxel that ``shade`` is relative to: the first of a block, zeros for a whole volume.
@@ -110,8 +108,7 @@ class Light(NamedTuple):
     head: int
     directions: np.ndarray
     shade: np.ndarray
-    shadows: int
-    occlusion: int
+    traced: int
     inv_cell: float
     edge: np.ndarray
     origin: np.ndarray
@@ -120,6 +117,6 @@ class Light(NamedTuple):
 # Types of the fields, for `jit.decorators.kernel`.
 TUPLES: dict[type, str] = {Voxels: "V", Optics: "f8 f8 f8:2 f8:2 f8:1 f8:1"}
 EXTINCTION: dict[type, str] = {**TUPLES, Voxels: "E"}
-LIT: dict[type, str] = {**TUPLES, Light: "f8 f8 f8 f8 i8 f8:2 f4:4 i8 i8 f8 f8:1 f8:1"}
+LIT: dict[type, str] = {**TUPLES, Light: "f8 f8 f8 f8 i8 f8:2 f4:4 i8 f8 f8:1 f8:1"}
 GRID: dict[type, str] = {Texels: "f4:4"}
 LIT_GRID: dict[type, str] = {**LIT, **EXTINCTION, **GRID}

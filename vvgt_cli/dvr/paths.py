@@ -4,7 +4,8 @@ Woodcock's tracking (1965) through the largest extinction of each brick; what th
 tracking (Novak et al. 2014), weighed against what scattered rays find by the balance heuristic (Veach 1997). Matter
 scatters by a mix, as Exposure Render has it (Kroes et al. 2012): Henyey and Greenstein's phase function (1941), and a
 matt surface turned to where the matter ends, whose share is the difference of opacity across it. Albedo is the look's
-colour to the power of `GAMMA`.
+colour to the power of `GAMMA`. Paths in white opaque matter go on for long: after `DENSE` scatterings they see matter
+that is at most so dense, the less the longer they are, so that they come out near by instead of being given up.
 
 Rays, ``voxels``, ``optics``, ``texels`` and ``empty`` are as in `march`; ``most`` (bz, by, bx) float64 is the largest
 extinction of each brick, ``limit`` that of all: denser matter counts as that dense. The numbers of a path follow from
@@ -37,7 +38,8 @@ from vvgt_cli.jit.decorators import inlined, parallel_kernel
 from vvgt_cli.jit.threads import ThreadSlice, next_iteration
 
 GAMMA = 2.2  # sRGB's, nearly
-BOUNCES = 256  # times a path is scattered at most: of white matter that is opaque, 4 % of the light are left out
+BOUNCES = 256  # times a path is scattered at most
+DENSE = 32  # of them before the densest matter counts as less dense, by the cube of their number
 CERTAIN = 3  # of them before chance ends paths that carry little
 NUDGE = 1e-9  # voxels beyond a brick's face
 CHUNK = 64  # points that a thread takes at once
@@ -98,7 +100,7 @@ def _next(
         bi = min(max(int(px + t * dx), 0), nx - 1) >> BRICK_BITS
         bj = min(max(int(py + t * dy), 0), ny - 1) >> BRICK_BITS
         bk = min(max(int(pz + t * dz), 0), nz - 1) >> BRICK_BITS
-        top, reach = most[U(bk), U(bj), U(bi)], max(int(empty[U(bk), U(bj), U(bi)]), 1)
+        top, reach = min(most[U(bk), U(bj), U(bi)], limit), max(int(empty[U(bk), U(bj), U(bi)]), 1)
         end = min(_face(px, dx, bi, reach), _face(py, dy, bj, reach), _face(pz, dz, bk, reach), t1)
         while t < end and top > 0.0:
             t -= math.log(1.0 - _random(state)) / top
@@ -225,13 +227,14 @@ def _arriving(
     red, green, blue, wr, wg, wb = 0.0, 0.0, 0.0, 1.0, 1.0, 1.0
     for bounce in range(BOUNCES):
         x, y, z = p
+        densest = limit * min(DENSE / max(bounce, 1), 1.0) ** 3
         n0, n1, n2, q = _surface(voxels, optics, edge, limit, x, y, z)
         e, k = _drawn(sky, state)
         cosine = max(n0 * e[0] + n1 * e[1] + n2 * e[2], 0.0)
         f = (1.0 - q) * _phase(w[0] * e[0] + w[1] * e[1] + w[2] * e[2], g) + q * cosine * 0.3183098861837907
         if f > 0.0:
             d = e[0] / edge[0], e[1] / edge[1], e[2] / edge[2]
-            f *= _next(voxels, optics, empty, most, limit, p, d, 0.0, state, True)[1] / (f + _density(sky, k))
+            f *= _next(voxels, optics, empty, most, densest, p, d, 0.0, state, True)[1] / (f + _density(sky, k))
             bright = sky.radiance[U(k // sky.radiance.shape[1]), U(k % sky.radiance.shape[1])]
             red, green, blue = red + wr * f * bright[0], green + wg * f * bright[1], blue + wb * f * bright[2]
         r, turn = _random(state), 6.283185307179586 * _random(state)
@@ -240,7 +243,7 @@ def _arriving(
         cosine = max(n0 * v[0] + n1 * v[1] + n2 * v[2], 0.0)
         f = (1.0 - q) * _phase(w[0] * v[0] + w[1] * v[1] + w[2] * v[2], g) + q * cosine * 0.3183098861837907
         d = v[0] / edge[0], v[1] / edge[1], v[2] / edge[2]
-        t, _ = _next(voxels, optics, empty, most, limit, p, d, 0.0, state, False)
+        t, _ = _next(voxels, optics, empty, most, densest, p, d, 0.0, state, False)
         if not t < np.inf:
             k = _texel(sky, v)
             f /= f + _density(sky, k)

@@ -11,7 +11,7 @@ from typing import cast
 import numpy as np
 
 from vvgt_cli.cameras import Camera
-from vvgt_cli.dvr.layout import TRACED, corners
+from vvgt_cli.dvr.layout import corners
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.look.function import TransferFunctionLike
 from vvgt_cli.look.tables import extinction
@@ -80,20 +80,18 @@ def shade(scene: Scene, points: np.ndarray, directions: np.ndarray) -> tuple[np.
     light = scene.light
     assert light is not None
     at = (points + 0.5) * light.inv_cell - 0.5
-    if light.shadows == TRACED:
+    if light.traced:
         return grid_values(light.shade.transpose(1, 2, 3, 0), at), np.zeros(len(points))
     normal = normals(scene, points)
     known = normal.any(axis=1)
     diffuse, white = np.zeros(len(points)), np.zeros(len(points))
-    lights = [(d, grid_values(light.shade[k], at) if light.shadows else 1.0) for k, d in enumerate(light.directions)]
-    for toward, part in [*lights, *([(-directions, 1.0)] if light.head else [])]:
+    for toward in [*light.directions, *([-directions] if light.head else [])]:
         half = toward - directions
         length = np.linalg.norm(half, axis=1)
         half = half / np.where(length > 1e-9, length, np.inf)[:, None]
-        diffuse += part * np.abs((normal * toward).sum(axis=1))
-        white += part * np.where(length > 1e-9, np.abs((normal * half).sum(axis=1)) ** light.power, 0)
-    open_ = grid_values(light.shade[-1], at) if light.occlusion else 1.0
-    factor = open_ * (light.ambient + light.diffuse * np.where(known, diffuse, 0))
+        diffuse += np.abs((normal * toward).sum(axis=1))
+        white += np.where(length > 1e-9, np.abs((normal * half).sum(axis=1)) ** light.power, 0)
+    factor = light.ambient + light.diffuse * np.where(known, diffuse, 0)
     return factor[:, None], light.specular * np.where(known, white, 0)
 
 

@@ -53,10 +53,9 @@ class Scene:
         optics: over stored values, extinction per unit-frame length.
         empty: (bz, by, bx) uint8 Chebyshev distance, in bricks, to the nearest brick with extinction (0: has some).
         half, step: (3,) float64 half extents and voxel edges in the unit frame, (x, y, z).
-        lighting: in world axes; ``light`` the same as kernels take it, with its shadows; None: colours are the
-            function's.
+        lighting: in world axes; ``light`` the same as kernels take it; None: colours are the function's.
         grid: (nz, ny, nx, 4) float32 extinction times (r, g, b, 1) per unit-frame length, of an optics grid: what is
-            drawn. ``values`` and ``optics`` then hold its extinction alone: what light, shadows and bricks ask for.
+            drawn. ``values`` and ``optics`` then hold its extinction alone: what light and bricks ask for.
         labels: the grid is one of labels alone.
         rays: draws in place of the CPU's kernels (`vvgt_cli.dvr.cuda`).
     """
@@ -141,9 +140,8 @@ class Scene:
         return scene if lighting is None else scene.lit(lighting)
 
     def lit(self, lighting: Lighting) -> Scene:
-        """Return the same scene under light; shadows and occlusion are marched here, the light of skies is traced."""
-        shape = self.values.shape
-        light = scene_light(lighting, self.volume.axes, self.step, shape, self._mean_extinction, self.scattering)
+        """Return the same scene under light; that of skies is traced here."""
+        light = scene_light(lighting, self.volume.axes, self.step, self.values.shape, self.scattering)
         return replace(self, lighting=lighting, light=light)
 
     def scattering(self) -> Scattering:
@@ -152,14 +150,6 @@ class Scene:
 
         texels = None if self.grid is None else self.texels
         return Scattering(self.voxels, self.optics, texels, self.empty, self.step)
-
-    def _mean_extinction(self, cell: int) -> np.ndarray:
-        """Average extinction per unit-frame length over cubes of ``cell`` voxels, (cz, cy, cx) float32."""
-        from vvgt_cli.dvr.shadows import cell_extinction
-
-        out = np.empty(tuple(-(-n // cell) for n in self.values.shape), np.float32)
-        cell_extinction(self.voxels, self.optics, self.empty, cell, out)
-        return out
 
 
 def kernel_values(volume: Volume) -> tuple[np.ndarray, float, float]:

@@ -8,7 +8,7 @@ from typing import Any
 import numba as nb
 import numpy as np
 
-from vvgt_cli.dvr.layout import TRACED, Light
+from vvgt_cli.dvr.layout import Light
 from vvgt_cli.dvr.vectors import Quad, four, lane, mix, sub, vector
 from vvgt_cli.jit.decorators import inlined
 
@@ -91,28 +91,12 @@ def shade_at(light: Light, channel: int, x: float, y: float, z: float) -> float:
 
 
 @_jit
-def openness(light: Light, x: float, y: float, z: float) -> float:
-    """Return how open the place is: 1 without occlusion."""
-    if light.occlusion == 0:
-        return 1.0
-    return shade_at(light, light.shade.shape[0] - 1, x, y, z)
-
-
-@_jit
-def arrives(light: Light, which: int, x: float, y: float, z: float) -> float:
-    """Return the share of a light that arrives: 1 without shadows."""
-    if light.shadows == 0:
-        return 1.0
-    return shade_at(light, which, x, y, z)
-
-
-@_jit
-def fixed_diffuse(light: Light, n0: float, n1: float, n2: float, x: float, y: float, z: float) -> float:
-    """Sum over the lights at infinity of what arrives times abs(n . l), of a normal n at voxel coordinates."""
+def fixed_diffuse(light: Light, n0: float, n1: float, n2: float) -> float:
+    """Sum over the lights at infinity of abs(n . l), of a normal n."""
     total = 0.0
     for which in range(light.directions.shape[0]):
         toward = light.directions[which]
-        total += arrives(light, which, x, y, z) * abs(n0 * toward[0] + n1 * toward[1] + n2 * toward[2])
+        total += abs(n0 * toward[0] + n1 * toward[1] + n2 * toward[2])
     return total
 
 
@@ -132,10 +116,8 @@ def _power(x: float, power: float) -> float:
 
 
 @_jit
-def _fixed_highlights(
-    light: Light, n0: float, n1: float, n2: float, d0: float, d1: float, d2: float, x: float, y: float, z: float
-) -> float:
-    """Sum over the lights at infinity of what arrives times abs(n . h)^power; the eye looks along the unit vector d."""
+def _fixed_highlights(light: Light, n0: float, n1: float, n2: float, d0: float, d1: float, d2: float) -> float:
+    """Sum over the lights at infinity of abs(n . h)^power; the eye looks along the unit vector d."""
     total = 0.0
     for which in range(light.directions.shape[0]):
         toward = light.directions[which]
@@ -143,7 +125,7 @@ def _fixed_highlights(
         length = math.sqrt(h0 * h0 + h1 * h1 + h2 * h2)
         if length > 1e-9:  # not looking straight into the light
             cosine = min(abs(n0 * h0 + n1 * h1 + n2 * h2) / length, 1.0)
-            total += arrives(light, which, x, y, z) * _power(cosine, light.power)
+            total += _power(cosine, light.power)
     return total
 
 
@@ -155,20 +137,18 @@ def shading(
 
     d is of the box frame.
     """
-    if light.shadows == TRACED:
+    if light.traced:
         return shade_at(light, 0, x, y, z), shade_at(light, 1, x, y, z), shade_at(light, 2, x, y, z), 0.0
-    open_ = openness(light, x, y, z)
     n0, n1, n2 = normal(values, light.edge, x, y, z)
     if n0 == 0.0 and n1 == 0.0 and n2 == 0.0:
-        dim = open_ * light.ambient
-        return dim, dim, dim, 0.0
-    diffuse, white = fixed_diffuse(light, n0, n1, n2, x, y, z), 0.0
+        return light.ambient, light.ambient, light.ambient, 0.0
+    diffuse, white = fixed_diffuse(light, n0, n1, n2), 0.0
     facing = min(abs(n0 * d0 + n1 * d1 + n2 * d2), 1.0)
     if light.head:
         diffuse += facing
     if light.specular > 0.0:
-        white = _fixed_highlights(light, n0, n1, n2, d0, d1, d2, x, y, z)
+        white = _fixed_highlights(light, n0, n1, n2, d0, d1, d2)
         if light.head:
             white += _power(facing, light.power)
-    factor = open_ * (light.ambient + light.diffuse * diffuse)
+    factor = light.ambient + light.diffuse * diffuse
     return factor, factor, factor, light.specular * white

@@ -15,6 +15,7 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.images.files import read_radiance
 
 ROWS, COLUMNS = 128, 256
+Toward = tuple[float, float, float]  # to the viewer's right, towards the viewer, up
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear red, green and blue, sRGB's primaries
 EVERY = 31  # texel is looked at for the brightest side
 
@@ -41,7 +42,8 @@ def sky_of(name: str, front: np.ndarray, axes: np.ndarray) -> Sky:
 
     Args:
         name: which, or the picture's path.
-        front: (3,) horizontal direction, world axes, in which the viewer stands.
+        front: (3,) direction, world axes, whose horizontal part points to where the viewer stands; all of it points to
+            the sun.
         axes: (3, 3) of the volume, as `Volume.axes`.
 
     Raises:
@@ -54,7 +56,8 @@ def sky_of(name: str, front: np.ndarray, axes: np.ndarray) -> Sky:
     ahead = ahead / np.linalg.norm(ahead) if ahead.any() else np.array([0.0, -1.0, 0.0])
     right = np.array([-ahead[1], ahead[0], 0.0])  # of the viewer
     x, y, z = world @ right, world @ ahead, world[:, 2]
-    radiance = _BY_NAME[name](x, y, z) if name in _BY_NAME else pictured(name, x, y, z)
+    toward = (0.0, math.hypot(front[0], front[1]), float(front[2]))
+    radiance = _BY_NAME[name](x, y, z, toward) if name in _BY_NAME else pictured(name, x, y, z)
     matt = np.clip(here[::EVERY] @ here.T, 0, None) @ radiance * 4 / len(here)
     radiance = radiance / matt.mean(axis=1).max()
     weight = np.cumsum(radiance @ LUMINANCE)
@@ -103,7 +106,7 @@ def pictured(path: str, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarr
     return mean
 
 
-def _box(x: np.ndarray, y: np.ndarray, z: np.ndarray, toward: tuple[float, float, float], angle: float) -> np.ndarray:
+def _box(x: np.ndarray, y: np.ndarray, z: np.ndarray, toward: Toward, angle: float) -> np.ndarray:
     """Return how much (n,) of a round soft box of ``angle`` degrees around ``toward`` is in each direction."""
     length = math.sqrt(sum(c * c for c in toward))
     cosine = (x * toward[0] + y * toward[1] + z * toward[2]) / length
@@ -118,7 +121,7 @@ def _colored(*parts: tuple[np.ndarray, tuple[float, float, float]]) -> np.ndarra
     return total
 
 
-def _studio(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+def _studio(x: np.ndarray, y: np.ndarray, z: np.ndarray, _: Toward) -> np.ndarray:
     """Return a key light in front at the upper left, a weaker one at the right, one behind, and grey walls."""
     key, fill = _box(x, y, z, (-0.6, 0.6, 0.62), 35), _box(x, y, z, (0.9, 0.5, 0.1), 40)
     rim = _box(x, y, z, (0.4, -0.8, 0.5), 25)
@@ -128,16 +131,21 @@ def _studio(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
     )  # fmt: skip
 
 
-def _overcast(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+def _overcast(x: np.ndarray, y: np.ndarray, z: np.ndarray, _: Toward) -> np.ndarray:
     """Return the CIE's standard overcast sky (Moon and Spencer 1942), over ground that reflects a fifth."""
     return _colored((np.where(z > 0, (1 + 2 * z) / 3, 0.2 * 7 / 9), (0.96, 0.99, 1.05)))
 
 
-def _window(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+def _window(x: np.ndarray, y: np.ndarray, z: np.ndarray, _: Toward) -> np.ndarray:
     """Return a large window at the left, slightly in front, in a dim room."""
     turn, height = np.arctan2(y, -x), np.arcsin(np.clip(z, -1, 1))
     pane = ((turn > -0.2) & (turn < 0.85) & (height > -0.15) & (height < 0.75)).astype(np.float64)
     return _colored((6 * pane, (0.94, 0.98, 1.06)), (0.16 + 0.06 * z, (1.08, 1.0, 0.9)))
 
 
-_BY_NAME = {"studio": _studio, "overcast": _overcast, "window": _window}
+def _sun(x: np.ndarray, y: np.ndarray, z: np.ndarray, toward: Toward) -> np.ndarray:
+    """Return a sun behind haze, 24 degrees wide, in a dim sky."""
+    return _colored((30 * _box(x, y, z, toward, 12), (1.0, 0.96, 0.88)), (0.2 + 0.12 * z, (0.88, 0.96, 1.12)))
+
+
+_BY_NAME = {"studio": _studio, "overcast": _overcast, "window": _window, "sun": _sun}

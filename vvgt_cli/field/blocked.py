@@ -14,7 +14,7 @@ from vvgt_cli.closed_form.columns import MOMENTS
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.dvr.render import BoxFrame, Rays, RenderSettings, first_rays, for_thin, more_rays
 from vvgt_cli.field.block_store import CELLS, BlockStore
-from vvgt_cli.field.cells import CellBlocks, ExtinctionBlocks, MeanBlocks, PointBlocks, RayBlocks, ValueBlocks
+from vvgt_cli.field.cells import CellBlocks, MeanBlocks, PointBlocks, RayBlocks, ValueBlocks
 from vvgt_cli.field.digests import digest, values_digest
 from vvgt_cli.field.field import Field, Picture, ViewRenderer
 from vvgt_cli.field.grid import CellGrid
@@ -119,7 +119,7 @@ class Blocked(Field):
 
     @cached_property
     def light(self) -> Light | None:
-        """Lighting for the kernels; shadows, occlusion and skies take a pass over the blocks."""
+        """Lighting for the kernels; skies take a pass over the blocks."""
         lighting, volume = self.source.lighting, self.source.volume
         if lighting is None:
             return None
@@ -131,12 +131,7 @@ class Blocked(Field):
             self.run_pass(task, "light")
             return task.scattering(self.frame.step)
 
-        def extinction(cell: int) -> np.ndarray:
-            task = ExtinctionBlocks(self.reader, self._grid(np.zeros(3, np.int64), cell), self.run_pass.store, cell)
-            self.run_pass(task, "light")
-            return task.gathered()
-
-        return scene_light(lighting, volume.axes, self.frame.step, volume.data.shape, extinction, matter)
+        return scene_light(lighting, volume.axes, self.frame.step, volume.data.shape, matter)
 
     def _grid(self, exponent: np.ndarray, least: int = 1) -> CellGrid:
         """Return a grid of cells of 2^``exponent`` voxels, in blocks made of whole cubes of ``least`` voxels."""

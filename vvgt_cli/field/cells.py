@@ -220,41 +220,13 @@ class ValueBlocks(Blockwise):
 
 
 @dataclass(frozen=True)
-class ExtinctionBlocks(Blockwise):
-    """Mean extinction of the cells in which shadows and occlusion are computed.
+class MeanBlocks(Blockwise):
+    """Mean values, or texels of an optics grid, of the cells through which the light of a sky is traced.
 
     Their edge is ``cell`` voxels, which divides that of a block.
     """
 
     cell: int
-    kind: str = "extinction"
-
-    def __call__(self, number: int) -> None:
-        """Save the cells of block ``number``."""
-        from vvgt_cli.dvr.bricks import brick_ranges, empty_distance
-        from vvgt_cli.dvr.shadows import cell_extinction
-
-        box = self.box(number, 0)
-        out = np.empty(tuple(-(-n // self.cell) for n in box.values.shape), np.float32)
-        empty = empty_distance(brick_ranges(box.values), box.optics)
-        cell_extinction(box.voxels, box.optics, empty, self.cell, out)
-        self.store.save(self.kind, number, extinction=out)
-
-    def gathered(self) -> np.ndarray:
-        """Return the cells of the whole volume, (cz, cy, cx[, 4]); raise DataError if one is missing or damaged."""
-        shape, out = tuple(-(-int(n) // self.cell) for n in self.grid.dims[::-1]), np.empty(0, np.float32)
-        for number in range(len(self)):
-            x, y, z = (int(n) // self.cell for n in self.grid.blocks.at(number)[0])
-            part = self.store.load(self.kind, number)[self.kind]
-            out = out if len(out) else np.empty((*shape, *part.shape[3:]), np.float32)
-            out[z : z + part.shape[0], y : y + part.shape[1], x : x + part.shape[2]] = part
-        return out
-
-
-@dataclass(frozen=True)
-class MeanBlocks(ExtinctionBlocks):
-    """Mean values, or texels of an optics grid, of the cells through which the light of a sky is traced."""
-
     kind: str = "means"
 
     def __call__(self, number: int) -> None:
@@ -266,6 +238,16 @@ class MeanBlocks(ExtinctionBlocks):
             means = np.add.reduceat(means, first, axis)
             means /= np.diff([*first, n]).reshape(-1, *[1] * (means.ndim - 1 - axis))
         self.store.save(self.kind, number, means=means.astype(np.float32))
+
+    def gathered(self) -> np.ndarray:
+        """Return the cells of the whole volume, (cz, cy, cx[, 4]); raise DataError if one is missing or damaged."""
+        shape, out = tuple(-(-int(n) // self.cell) for n in self.grid.dims[::-1]), np.empty(0, np.float32)
+        for number in range(len(self)):
+            x, y, z = (int(n) // self.cell for n in self.grid.blocks.at(number)[0])
+            part = self.store.load(self.kind, number)[self.kind]
+            out = out if len(out) else np.empty((*shape, *part.shape[3:]), np.float32)
+            out[z : z + part.shape[0], y : y + part.shape[1], x : x + part.shape[2]] = part
+        return out
 
     def scattering(self, step: np.ndarray) -> Scattering:
         """Return what `gathered` does as paths are traced through it; ``step`` (3,) voxel edges, unit frame."""

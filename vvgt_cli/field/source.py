@@ -278,7 +278,7 @@ class StyledVolume:
     def kernels(self, names: tuple[str, ...]) -> tuple[str, ...]:
         """Return the names of a command's kernels for this kind of scene and light."""
         light = self.lighting
-        lit = names if light is None else for_light(names, light.attenuated, light.sky is not None)
+        lit = names if light is None else for_light(names, light.sky is not None)
         return for_grid(lit) if self.gridded else lit
 
     def kernel_type(self) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 RENDER, RENDER_LIT = "vvgt_cli.dvr.march:render_tiles", "vvgt_cli.dvr.march:render_lit_tiles"
 BLOCK_RANGES = "vvgt_cli.dvr.bricks:block_ranges"
 SHADE = ("vvgt_cli.closed_form.lit:_shade", "vvgt_cli.closed_form.lit:point_normals")
-SHADOWS = ("vvgt_cli.dvr.shadows:mean_transmittance", "vvgt_cli.dvr.shadows:cell_extinction")
 PATHS = ("vvgt_cli.dvr.paths:gather", "vvgt_cli.dvr.paths:first_scatterings")
 MARCH, ADD_CELLS = "vvgt_cli.closed_form.visibility:march", "vvgt_cli.closed_form.visibility:add_cells"
 BLOCK_MOMENTS, COMPACT = "vvgt_cli.closed_form.quadrature:block_moments", "vvgt_cli.closed_form.quadrature:compact"
@@ -81,7 +80,6 @@ ALL = (
     GREY[-1],
     RENDER_LIT,
     *SHADE,
-    *SHADOWS,
     *PATHS,
     *GRID.values(),
     "vvgt_cli.dvr.place:place",
@@ -102,10 +100,10 @@ ALL = (
 )
 
 
-def for_light(names: tuple[str, ...], attenuated: bool, sky: bool = False) -> tuple[str, ...]:
-    """Return the kernels of a command whose scene is lit, ``attenuated`` by shadows or occlusion, or by a ``sky``."""
+def for_light(names: tuple[str, ...], sky: bool) -> tuple[str, ...]:
+    """Return the kernels of a command whose scene is lit, by a ``sky`` or else."""
     rays = tuple(RENDER_LIT if name == RENDER else name for name in names)
-    return (*rays, *(SHADE if MARCH in names else ()), *(PATHS if sky else SHADOWS if attenuated else ()))
+    return (*rays, *(SHADE if MARCH in names else ()), *(PATHS if sky else ()))
 
 
 def for_degree(names: tuple[str, ...], degree: int) -> tuple[str, ...]:

@@ -18,7 +18,8 @@ COEFFICIENTS = ("ambient", "diffuse", "specular", "specular_power")
 HEADLIGHT, NONE = "headlight", "none"
 MAX_LIGHT = 1000.0  # of a coefficient: a highlight with a larger power is a point
 AXES = {axis: tuple(float(letter == axis) for letter in "xyz") for axis in "xyz"}
-SKIES = ("studio", "overcast", "window")  # light from all around, traced along paths
+SUN = "sun"
+SKIES = ("studio", "overcast", "window", SUN)  # light from all around, traced along paths
 WORDS = ("left", "right", "anterior", "posterior", "superior", "inferior", "above", "below")
 EXPECTED = (
     f"expected {', '.join(SKIES)}, FILE.hdr, {HEADLIGHT}, X,Y,Z, x, -x, y, -y, z, -z, {', '.join(WORDS[:-1])} or "
@@ -42,14 +43,12 @@ class Lighting:
         headlight: a light at the eye.
         directions: unit vectors towards lights at infinity, world axes.
         ambient, diffuse, specular, specular_power: ka, kd, ks, p.
-        shadows: lights at infinity are attenuated on their way.
-        occlusion: unit-frame length within which surroundings attenuate ambient and diffuse light; None: not at all.
         sky: one of `SKIES` or the path of a picture, which lights alone, in place of the model above: ``directions``
-            then holds the one in which its viewer stands.
+            then holds the one in which its viewer stands, or the sun.
 
     Raises:
-        UsageError: no light, a direction of length zero, a coefficient outside of [0, `MAX_LIGHT`],
-            shadows without a light that casts any, other lights or options beside a sky.
+        UsageError: no light, a direction of length zero, a coefficient outside of [0, `MAX_LIGHT`], other lights beside
+            a sky.
     """
 
     headlight: bool = True
@@ -58,16 +57,14 @@ class Lighting:
     diffuse: float = DIFFUSE
     specular: float = SPECULAR
     specular_power: float = POWER
-    shadows: bool = False
-    occlusion: float | None = None
     sky: str | None = None
 
     def __post_init__(self) -> None:
         """Check lights and coefficients."""
-        if self.sky is not None and (self.headlight or len(self.directions) != 1 or self.shadows or self.occlusion):
+        if self.sky is not None and (self.headlight or len(self.directions) != 1):
             raise UsageError(
-                f"--light {self.sky}: a sky lights alone, with shadows of its own; remove other lights, --shadows and "
-                "--ambient-occlusion, but one direction, X,Y,Z, where its viewer stands"
+                f"--light {self.sky}: a sky lights alone; remove other lights, but one direction, X,Y,Z, where its "
+                f"{SUN if self.sky == SUN else 'viewer'} stands"
             )
         if not (self.headlight or self.directions):
             raise UsageError(f"no light; {EXPECTED}")
@@ -75,27 +72,17 @@ class Lighting:
             value = getattr(self, name)
             if not 0 <= value <= MAX_LIGHT:
                 raise UsageError(f"--{name.replace('_', '-')} {value:g}: expected 0 to {MAX_LIGHT:g}")
-        if self.occlusion is not None and not 0 < self.occlusion < math.inf:
-            raise UsageError(f"--ambient-occlusion {self.occlusion:g}: expected a length above 0")
-        if self.shadows and not self.directions:
-            raise UsageError("--shadows: a headlight casts no visible shadows; add --light X,Y,Z, or omit --shadows")
 
     @property
     def depends_on_view(self) -> bool:
         """Return whether colours change with the eye."""
         return self.sky is None and ((self.headlight and self.diffuse > 0) or self.specular > 0)
 
-    @property
-    def attenuated(self) -> bool:
-        """Return whether light is followed through the scene, for shadows, occlusion or a sky."""
-        return self.shadows or self.occlusion is not None or self.sky is not None
-
     def text(self) -> str:
         """Return one line for the header of a `.ply`; `parse_lighting` reads it."""
         words = [repr(float(getattr(self, name))) for name in COEFFICIENTS]
         words += [HEADLIGHT] * self.headlight + [",".join(repr(v) for v in d) for d in self.directions]
-        words += ["shadows"] * self.shadows + ([] if self.sky is None else ["sky", quote(self.sky)])
-        return " ".join(words + ([] if self.occlusion is None else ["occlusion", repr(float(self.occlusion))]))
+        return " ".join(words + ([] if self.sky is None else ["sky", quote(self.sky)]))
 
     def key(self) -> str:
         """Return `text` with the SHA-256 of a sky's picture, by which certificates and checkpoints know the light."""
@@ -108,18 +95,14 @@ def parse_lighting(text: str) -> Lighting:
     """Parse a line of `Lighting.text`; raise ValueError or UsageError for another text."""
     words = text.split()
     numbers: list[Any] = [float(word) for word in words[:4]]
-    rest = words[4:]
-    more: dict[str, str] = {}
-    for name in {"occlusion", "sky"}.intersection(rest):
-        at = rest.index(name)
-        more[name], rest = rest[at + 1], rest[:at] + rest[at + 2 :]
-    sky = unquote(more["sky"]) if "sky" in more else None
-    occlusion = float(more["occlusion"]) if "occlusion" in more else None
-    if known := set(rest) - {HEADLIGHT, "shadows"} - {w for w in rest if "," in w}:
-        raise ValueError(known)
-    toward = _directions([w for w in rest if "," in w], None)
-    lighting = Lighting(HEADLIGHT in rest, toward, *numbers)
-    return replace(lighting, shadows="shadows" in rest, occlusion=occlusion, sky=sky)
+    rest, sky = words[4:], None
+    if "sky" in rest:
+        *rest, _, sky = rest
+        sky = unquote(sky)
+    toward = [word for word in rest if "," in word]
+    if unknown := set(rest) - {HEADLIGHT, *toward}:
+        raise ValueError(unknown)
+    return replace(Lighting(HEADLIGHT in rest, _directions(toward, None), *numbers), sky=sky)
 
 
 @dataclass(frozen=True)
@@ -130,7 +113,6 @@ class LightOptions:
         lights: ``none``, ``headlight``, one of `SKIES`, a picture, ``X,Y,Z``, an axis or a word of `WORDS`; empty:
             those of the function's file.
         ambient, diffuse, specular, specular_power: coefficients.
-        shadows, occlusion: as in `Lighting`.
     """
 
     lights: tuple[str, ...] = ()
@@ -138,12 +120,10 @@ class LightOptions:
     diffuse: float | None = None
     specular: float | None = None
     specular_power: float | None = None
-    shadows: bool = False
-    occlusion: float | None = None
 
     @classmethod
     def of(cls, lighting: Lighting | None) -> LightOptions:
-        """Return the options that ask for a light without shadows and occlusion; None: for none."""
+        """Return the options that ask for a light other than a sky; None: for none."""
         if lighting is None:
             return cls((NONE,))
         lights = (HEADLIGHT,) * lighting.headlight + tuple(",".join(map(repr, d)) for d in lighting.directions)
@@ -152,13 +132,11 @@ class LightOptions:
     def lighting(self, preset: Lighting | None, space: str | None) -> Lighting | None:
         """Return a scene's light, None if unlit; ``preset`` is the function file's. Raise UsageError if invalid."""
         given = {name: getattr(self, name) for name in COEFFICIENTS if getattr(self, name) is not None}
-        given |= {"occlusion": self.occlusion} if self.occlusion is not None else {}
-        given |= {"shadows": True} if self.shadows else {}
         if NONE in self.lights or not (self.lights or preset):
             if len(self.lights) > 1:
                 raise UsageError(f"--light {' --light '.join(self.lights)}: expected none, or other lights, not both")
             if given:
-                name = {"occlusion": "ambient-occlusion"}.get(first := next(iter(given)), first.replace("_", "-"))
+                name = next(iter(given)).replace("_", "-")
                 raise UsageError(f"--{name}: there is no light; add --light headlight or a direction, --light X,Y,Z")
             return None
         if not self.lights:
@@ -173,8 +151,9 @@ class LightOptions:
         return Lighting(HEADLIGHT in self.lights, fixed, **(kept | given))
 
     def _sky(self, sky: str, space: str | None, given: dict[str, Any]) -> Lighting:
-        """Return the light of a sky, whose viewer stands in front of a body, else at -y."""
-        front = [light for light in self.lights if light != sky] or ["-y" if space is None else "anterior"]
+        """Return the light of a sky: its viewer stands in front of a body, else at -y, the sun above."""
+        ahead = "above" if sky == SUN else "-y" if space is None else "anterior"
+        front = [light for light in self.lights if light != sky] or [ahead]
         if unused := sorted(set(given) & set(COEFFICIENTS)):
             raise UsageError(
                 f"--{unused[0].replace('_', '-')}: matter under --light {sky} scatters all that its colour does not "
@@ -182,7 +161,7 @@ class LightOptions:
             )
         if len(front) > 1 or front[0] == HEADLIGHT or is_sky(front[0]):
             front = []
-        return Lighting(False, _directions(front, space), **given, sky=sky)
+        return Lighting(False, _directions(front, space), sky=sky)
 
 
 MATTE = Lighting(ambient=0.2, diffuse=1.0, specular=0.0)  # as most presets of 3D Slicer have it
