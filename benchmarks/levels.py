@@ -28,9 +28,8 @@ from vvgt_cli.conversion.place import to_box_frame
 from vvgt_cli.dvr import Scene, render_view
 from vvgt_cli.field.source import SourceRequest, StyledVolume, load
 from vvgt_cli.gaussians import Gaussians, in_unit_frame
-from vvgt_cli.gaussians.formats.levels import StreamedLevels
 from vvgt_cli.gaussians.formats.splats import gaussians_of
-from vvgt_cli.gaussians.formats.streamed import MANIFEST, nodes_of, read_manifest
+from vvgt_cli.gaussians.formats.streamed import MANIFEST, StreamedLevels, nodes_of, read_manifest
 from vvgt_cli.gaussians.frames import up_matrix
 from vvgt_cli.images.metrics import OPAQUE, SMOOTH, band
 from vvgt_cli.score.viewing import VIEWS, near_cameras

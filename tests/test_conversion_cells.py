@@ -6,7 +6,7 @@ import pytest
 from tests.test_conversion_plan import WORKLOAD, darkened, done, of
 from vvgt_cli.closed_form.fit import solve_colors
 from vvgt_cli.conversion.plan import Planner
-from vvgt_cli.conversion.request import FitOptions, Limits
+from vvgt_cli.conversion.request import FitOptions
 from vvgt_cli.conversion.stages import CellsByError
 
 
@@ -50,7 +50,7 @@ def test_cells_are_chosen_by_views_from_all_sides(tmp_path, monkeypatch):
 
 def test_cells_are_cut_by_error_where_there_is_a_pyramid_and_steps_follow():
     def cut(steps, init="moments", model=None, **limits):
-        found = Planner(Limits(**limits), FitOptions(1000, 400, init, steps=steps, model=model)).plan(WORKLOAD, 1.0)
+        found = Planner(FitOptions(1000, 400, init, steps=steps, model=model, **limits)).plan(WORKLOAD, 1.0)
         return of(found, CellsByError)
 
     assert cut(24) is not None

@@ -13,7 +13,7 @@ from vvgt_cli.cameras.blocks import BLOCK, ENOUGH, FEW, spread_blocks
 from vvgt_cli.conversion.convert import convert
 from vvgt_cli.conversion.fitting import plan_of
 from vvgt_cli.conversion.plan import Planner, check_memory
-from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
+from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.stages import BackProjection, Network, Refinement, TrainingViews
 from vvgt_cli.conversion.stages.refinement import WIDER
 from vvgt_cli.conversion.stages.views import view_count
@@ -36,9 +36,7 @@ SMALL = FitOptions(400, 48)
 def plan(steps=None, spent=1.0, begun=False, workload=WORKLOAD, size=48, wide=True, **limits):
     """The plan of a method without cells that could be cut again."""
     workload = replace(workload, size=size)
-    return Planner(Limits(**limits), FitOptions(1000, size, "wavelet", steps=steps), wide=wide).plan(
-        workload, spent, begun
-    )
+    return Planner(FitOptions(1000, size, "wavelet", steps=steps, **limits), wide=wide).plan(workload, spent, begun)
 
 
 def of(found, kind):
@@ -161,7 +159,7 @@ def test_views_that_do_not_fit_are_refused(monkeypatch):
 def test_gaussians_that_do_not_fit_are_refused_with_the_number_that_would(monkeypatch):
     monkeypatch.setattr("vvgt_cli.closed_form.closed_form.expected_cells", lambda *sizes: 2.0 * sizes[3])
     workload = replace(WORKLOAD, gaussians=1_000_000, cells=2e6)
-    found = Planner(Limits(), FitOptions(1_000_000, 48, steps=0)).plan(workload, 1.0)
+    found = Planner(FitOptions(1_000_000, 48, steps=0)).plan(workload, 1.0)
     each, views = 0.8 * (2 * 294 + 1240), 0.8 * 32 * 48**2 * 29
     monkeypatch.setattr("vvgt_cli.conversion.plan.free_memory", lambda: each * 1e6 + views + 1)
     check_memory(found)
@@ -236,11 +234,11 @@ def test_more_time_is_more_steps_and_never_more_than_the_time():
 
 
 def test_a_network_runs_where_there_is_time_for_it():
-    planner = Planner(Limits(), FitOptions(1000, 400, model="some"))
+    planner = Planner(FitOptions(1000, 400, model="some"))
     workload = replace(WORKLOAD, size=400)
     assert of(planner.plan(workload, 1.0), Network).model == "some"
     assert not of(planner.plan(workload, 1.0), Refinement).small  # it was trained on whole views
-    short = Planner(Limits(time_budget=7.0), FitOptions(1000, 400, model="some")).plan(workload, 1.0)
+    short = Planner(FitOptions(1000, 400, model="some", time_budget=7.0)).plan(workload, 1.0)
     assert of(short, Network) is None
     assert "network" in {name for name, _ in short.skipped}
 
@@ -301,21 +299,21 @@ def test_views_come_in_sets():
     ],
 )
 def test_limits_that_cannot_be_are_refused(limits, line):
-    refused(UsageError, line, Limits, **limits)
+    refused(UsageError, line, FitOptions, **limits)
 
 
 @pytest.mark.parametrize("degree", [0, 3])
 def test_a_size_is_kept_to_the_byte_and_one_without_room_is_refused(degree, tmp_path):
-    fit, limits = FitOptions(100_000, 48, steps=0), Limits(max_megabytes=0.02)
-    report = done(tmp_path, fit, limits=limits, ply=PlyOptions(sh_degree=degree))
+    fit = FitOptions(100_000, 48, steps=0, max_megabytes=0.02)
+    report = done(tmp_path, fit, ply=PlyOptions(sh_degree=degree))
     assert report.gaussians == len(read_ply(tmp_path / "a.ply")[0])
     assert 0.02e6 - 4500 < report.bytes <= 0.02e6  # room for a long legend is left
     assert (tmp_path / "a.ply").stat().st_size == report.bytes
-    refused(UsageError, "no Gaussian fits", done, tmp_path, limits=Limits(max_megabytes=0.001))
+    refused(UsageError, "no Gaussian fits", done, tmp_path, replace(SMALL, max_megabytes=0.001))
 
 
 def test_a_target_that_the_closed_form_has_pays_for_nothing_else(tmp_path):
-    report = done(tmp_path, limits=Limits(target_psnr=10.0))
+    report = done(tmp_path, replace(SMALL, target_psnr=10.0))
     assert names(report) == [
         "read", "scene", "closed form", "check views", "write", "test views", "conditions", "certificate",
     ]  # fmt: skip
@@ -327,21 +325,21 @@ def test_a_target_that_the_closed_form_has_pays_for_nothing_else(tmp_path):
 def test_a_target_between_ends_refinement_when_it_is_reached(tmp_path):
     start = done(tmp_path, FitOptions(400, 48, steps=24)).stages
     before = next(stage.psnr_before for stage in start if stage.name == "refinement")
-    report = done(tmp_path, limits=Limits(target_psnr=before + 1), overwrite=True)
+    report = done(tmp_path, replace(SMALL, target_psnr=before + 1), overwrite=True)
     assert report.refinement["reason"] == "target"
     assert report.refinement["psnr_after"] >= before + 1
     assert report.refinement["steps"] < MAX_STEPS
 
 
 def test_a_hopeless_target_ends_and_writes_the_best(tmp_path):
-    report = done(tmp_path, FitOptions(50, 32), limits=Limits(target_psnr=90.0))
+    report = done(tmp_path, FitOptions(50, 32, target_psnr=90.0))
     assert report.refinement["reason"] in ("steps", "no gain")
     assert report.refinement["psnr_after"] >= report.refinement["psnr_before"]
     assert len(read_ply(tmp_path / "a.ply")[0]) == report.gaussians
 
 
 def test_no_time_leaves_the_closed_form(tmp_path):
-    report = done(tmp_path, limits=Limits(time_budget=1e-3))
+    report = done(tmp_path, replace(SMALL, time_budget=1e-3))
     assert names(report) == ["read", "scene", "closed form", "write", "test views", "certificate"]
     assert len(read_ply(tmp_path / "a.ply")[0]) == report.gaussians > 0
 

@@ -13,6 +13,7 @@ from vvgt_cli.cameras import Camera, default_views, orbit_views
 from vvgt_cli.commands import pictures as render
 from vvgt_cli.commands.main import run
 from vvgt_cli.dvr import reference
+from vvgt_cli.field.field import Resident
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.live import LENGTH, SPREAD, TAU, VALUE, Table, apply_look, directions
@@ -125,7 +126,7 @@ def test_a_volumes_mip_is_its_twins(tmp_path: Path) -> None:
         best = np.maximum(best, np.where(k < count, value, 0))
     wanted = best.reshape(SIZE, SIZE, -1).mean(axis=2)
     assert 0.2 < wanted.mean() < 0.9
-    np.testing.assert_allclose(render.mip_of(source)(eye)[..., 0], wanted, atol=1e-4)
+    np.testing.assert_allclose(render.mip_of(Resident.of(source))(eye)[..., 0], wanted, atol=1e-4)
 
 
 def test_the_x_ray_of_a_uniform_volume_keeps_1_over_e_along_its_edge(tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ import pytest
 
 import vvgt_cli as library
 from tests.refused import refused
-from vvgt_cli.conversion.recolored import parse_layer_look
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.source import parse_layer
 from vvgt_cli.gaussians import read_ply
@@ -102,9 +101,7 @@ def test_layers_take_levels(tmp_path: Path) -> None:
     named.touch()
     assert (one := parse_layer(f"{named},iso=5")).volume == str(named)
     assert one.tf == "iso:5"
-    assert parse_layer_look("1,iso=0.5,#ff0000").tf == "iso:0.5,#ff0000"
     refused(UsageError, "expected FILE and any of iso=", parse_layer, "a.mrc,iso=1,tf=hot")
-    refused(UsageError, "expected LAYER,tf=TF, LAYER,iso=LEVEL", parse_layer_look, "1,iso=1,tf=hot")
 
 
 def test_commands_take_levels_in_memory_in_blocks_and_live(tmp_path: Path, vvgt) -> None:

@@ -22,7 +22,7 @@ from vvgt_cli.closed_form.gaussian_samples import (
     values_of,
 )
 from vvgt_cli.conversion.live import fog
-from vvgt_cli.conversion.recolored import FunctionRequest, resolve_look
+from vvgt_cli.conversion.recolored import resolve_look
 from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.dvr.layout import Voxels
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
@@ -370,7 +370,9 @@ def test_the_legend_of_another_look_has_the_unit_that_a_conversion_would_state(t
     known = replace(facts(), lo=-1024.0, hi=1500.0, histogram=tuple(counts.tolist()), unit="")
     affine = (1.0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 1.0, 0)
     header = PlyOptions(scale=0.1, unit_distance=1.0, affine=affine, live=known)
-    legend = resolve_look("a.ply", header, FunctionRequest(tf))[1].legend
+    from vvgt_cli.field.source import SourceRequest
+
+    legend = resolve_look("a.ply", header, SourceRequest("", tf=tf))[1].legend
     assert legend is not None
     assert json.loads(legend)["unit"] == unit
 

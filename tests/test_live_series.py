@@ -12,7 +12,7 @@ import vvgt_cli as vvgt_library
 from tests.test_live_labels import LABELS
 from tests.test_live_layers import TF, several
 from vvgt_cli.gaussians import read_ply
-from vvgt_cli.gaussians.live_facts import LAYER_ID, shared_facts
+from vvgt_cli.gaussians.live_facts import LAYER_ID
 
 SMALL = ("--max-gaussians", 90, "--screen", 48)
 
@@ -66,16 +66,9 @@ def test_a_layer_that_is_empty_in_a_frame_is_skipped(vvgt, tmp_path, labelled: b
         assert np.unique(live[:, LAYER_ID]).tolist() == numbers  # type: ignore[index]
 
 
-def test_layers_have_in_common_what_each_has_of_all() -> None:
-    """Labels of each frame are renumbered in their own layer alone."""
+def test_files_are_shown_alike_whose_layers_are() -> None:
     value, named = several().layers
     first, second = (replace(value, others=(replace(named, labels=some),)) for some in (LABELS[:2], LABELS[1:]))
-    both = shared_facts([first, second])
-    assert both.layers == (value, replace(named, labels=LABELS))
-    for other in (replace(second, lo=-1e9), value, replace(second, others=(value,)), None):
-        assert shared_facts([first, other]) is None
-    other = replace(named, labels=(replace(LABELS[0], name="left  liver"), LABELS[1]))
-    both = shared_facts([first, replace(value, others=(other,))])
-    assert [(label.number, label.name) for label in both.others[0].labels] == [
-        (3, "left  liver"), (3, "liver"), (7, LABELS[1].name),
-    ]  # fmt: skip
+    assert first.shown_like(second)
+    for other in (replace(second, lo=-1e9), value, replace(second, others=(value,))):
+        assert not first.shown_like(other)

@@ -8,7 +8,7 @@ import nibabel as nib
 import numpy as np
 import pytest
 
-from vvgt_cli.conversion.label_assignment import HiddenCells, assign_labels
+from vvgt_cli.conversion.labels import HiddenCells, assign_labels
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians, in_unit_frame
 from vvgt_cli.gaussians.formats import read_splats

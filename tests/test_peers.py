@@ -44,7 +44,7 @@ def start(tmp_path_factory):
 
 def test_a_peer_is_run_timed_and_scored_beside_ours(vvgt, start, tmp_path, monkeypatch) -> None:
     planned = report.plan_runs
-    monkeypatch.setattr(report, "plan_runs", lambda options: planned(options)[:5])  # it, and the closed forms
+    monkeypatch.setattr(report, "plan_runs", lambda *of: planned(*of)[:5])  # it, and the closed forms
     command = f"{sys.executable} {start / 'make.py'} {start / 'start.ply'} {{views}} {{out}}"
     vvgt.ok("report", "example:blob:10", *SMALL, "--peer", f"Other one={command}", "-o", tmp_path / "out")
     found = json.loads((tmp_path / "out" / "report.json").read_text())

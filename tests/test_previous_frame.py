@@ -23,7 +23,7 @@ from vvgt_cli.field.field import Resident
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply
 from vvgt_cli.gaussians.formats.gsply_files import read_compressed_ply
-from vvgt_cli.gaussians.formats.page_frames import patch, stored_frames
+from vvgt_cli.gaussians.formats.page_file import patch, stored_frames
 from vvgt_cli.gaussians.formats.splats import splats_of
 from vvgt_cli.refine import OptimizeOptions, optimize
 from vvgt_cli.splat import render

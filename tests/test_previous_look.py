@@ -10,7 +10,7 @@ import pytest
 import vvgt_cli as vvgt
 from tests.refused import refused
 from vvgt_cli.conversion.place import to_box_frame, to_unit_frame
-from vvgt_cli.conversion.previous_look import MAX_RATIO, OPAQUE, WARM_START, recolor_earlier
+from vvgt_cli.conversion.previous_look import MAX_RATIO, OPAQUE, PreviousLook, recolor_earlier
 
 GOAL = {"max_gaussians": 400, "screen": 96, "steps": 24}
 SPACING = (1.0, 1.0, 1.5)
@@ -61,7 +61,7 @@ def earlier(session):
 
 
 def started_warm(result):
-    return not [why for name, why in result.report.skipped if name == WARM_START]
+    return not [why for name, why in result.report.skipped if name == PreviousLook.name]
 
 
 def names(result):
@@ -110,7 +110,7 @@ def test_another_light_and_another_size(session, earlier):
 def test_what_is_too_far_is_converted_by_itself(session, earlier, look, goal, why):
     asked = {**GOAL, **goal}
     later, alone = session.convert(look, **asked, after=earlier), session.convert(look, **asked)
-    assert why in dict(later.report.skipped)[WARM_START]
+    assert why in dict(later.report.skipped)[PreviousLook.name]
     assert np.array_equal(later.gaussians.means, alone.gaussians.means)
     assert np.array_equal(later.gaussians.colors, alone.gaussians.colors)
     assert names(later)[-1] == "conditions"

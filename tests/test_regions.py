@@ -13,7 +13,7 @@ from tests.test_scale import bodies
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.commands.main import run
 from vvgt_cli.conversion.parts import PartTask, Refiner, refine_part
-from vvgt_cli.conversion.request import FitOptions, Limits
+from vvgt_cli.conversion.request import FitOptions
 from vvgt_cli.dvr import RenderSettings, render_view
 from vvgt_cli.dvr.render import BoxFrame
 from vvgt_cli.dvr.scene import Scene, kernel_rule
@@ -132,7 +132,7 @@ def test_descent_on_a_part_weighs_both_kinds_of_views(volume: Path, monkeypatch:
         return args[0], OptimizeRecord(psnr_before=1.0)
 
     monkeypatch.setattr("vvgt_cli.conversion.stages.refinement.optimize", spied)
-    refine_part(part, part.moved_out(ball()), Refiner(None, None, FitOptions(screen=150, steps=4), Limits()))
+    refine_part(part, part.moved_out(ball()), Refiner(None, None, FitOptions(screen=150, steps=4)))
     assert all((weight == 0.25).all() for weight in seen[way])
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from tests.processes import replaced
 from tests.view_sets import BASE, SMALL, TF, VOLUME, make_views
+from vvgt_cli import dvr
 from vvgt_cli.conversion.manifest import read_manifest
 from vvgt_cli.errors import DataError
 
@@ -49,9 +50,7 @@ def test_a_missing_and_a_cut_and_a_changed_file_are_made_again(vvgt, copied, mad
 
 
 def test_a_run_that_is_killed_goes_on(vvgt, tmp_path, made, monkeypatch):
-    from vvgt_cli.dvr import backends
-
-    drawn, real = [], backends.render_view
+    drawn, real = [], dvr.render_view
 
     def dying(scene, camera, settings=None):
         if len(drawn) == 2:
@@ -60,13 +59,13 @@ def test_a_run_that_is_killed_goes_on(vvgt, tmp_path, made, monkeypatch):
         return real(scene, camera, settings)
 
     call = (*BASE, "-o", tmp_path / "v")
-    monkeypatch.setattr(backends, "render_view", dying)
+    monkeypatch.setattr(dvr, "render_view", dying)
     assert vvgt(*call).code == 130
     assert drawn == ["train_000", "train_001"]
     before = stamps(tmp_path / "v")
     assert not any(path.name.startswith(".") for path in before)
     (tmp_path / "v" / "test" / ".test_000.0123abcd.exr").write_text("left by a run that was killed outright")
-    monkeypatch.setattr(backends, "render_view", real)
+    monkeypatch.setattr(dvr, "render_view", real)
     assert "3 to render here" in vvgt(*call).err
     after = stamps(tmp_path / "v")
     assert not any(path.name.startswith(".") for path in after)

@@ -13,7 +13,8 @@ import pytest
 from tests.onnx_models import write_model
 from tests.refused import refused
 from tests.report_runs import document, run, runs
-from vvgt_cli.commands.report_runs import RunOptions, plan_runs, random_points
+from vvgt_cli.commands.report_runs import plan_runs, random_points
+from vvgt_cli.conversion.request import FitOptions
 from vvgt_cli.errors import DataError
 from vvgt_cli.images import read_png
 from vvgt_cli.score.charts import FILES, draw
@@ -161,7 +162,7 @@ def test_compare_reads_reports_and_conversions(scene_report, vvgt, tmp_path):
     [
         (("report", "-", "-o", "x"), "every run reads it again"),
         (("report", "example:blob", "-o", "-"), "a folder of files"),
-        (("report", "example:blob", "-o", "no/where"), "does not exist"),
+        (("report", "example:blob", "-o", "no/where"), "no directory no"),
         (("report", "example:blob", "-o", "file"), "is a file"),
         (("report", "example:blob", "example:slab", "-o", "x"), "2 volumes; expected one"),
         (("report", "--compare", "file", "-o", "x"), "expected two or more"),
@@ -286,11 +287,11 @@ def test_several_reports_have_different_names(tmp_path, vvgt):
 
 
 def test_rungs_follow_the_options_and_random_points_fill_the_box():
-    names = [r.name for r in plan_runs(RunOptions(64_000, 100, (100, 25, 25), "m/net", 3))]
+    names = [r.name for r in plan_runs(FitOptions(64_000, 100, model="m/net", seed=3), (100, 25, 25))]
     assert names[:5] == ["closed form, K = 1k", "closed form, K = 4k", "closed form, K = 16k", "closed form, K = 64k",
                          "network net"]  # fmt: skip
     assert names[5:] == ["25 steps", "100 steps", "3DGS, 100 steps", "iVR-GS setting, 100 steps"]
-    assert len(plan_runs(RunOptions(1))) == 1 + 4 + 2
+    assert len(plan_runs(FitOptions(1))) == 1 + 4 + 2
     half = np.array([1.0, 0.5, 0.1])
     points = random_points(half, 2000, 0)
     assert (np.abs(points.means) <= half).all()

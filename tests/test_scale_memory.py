@@ -218,7 +218,7 @@ def test_a_converted_volume_is_released_at_once(monkeypatch, blocks, live):
     one = ConvertRequest(source, fit=fit, blocks=blocks, live=live)
     gc.disable()
     try:
-        convert_batch._run(Functions(dict.fromkeys("abc", one)), convert_batch.Memory(), Console(quiet=True))
+        convert_batch._run(Functions(dict.fromkeys("abc", one)), None, Console(quiet=True))
     finally:
         gc.enable()
     assert alive == [0, 0, 0]

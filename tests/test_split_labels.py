@@ -10,7 +10,7 @@ from tests.processes import VVGT, python
 from vvgt_cli.closed_form import VbmOptions
 from vvgt_cli.closed_form.tree import HIDDEN
 from vvgt_cli.conversion import labels as split
-from vvgt_cli.conversion.label_assignment import HiddenCells, assign_labels, hidden_cells
+from vvgt_cli.conversion.labels import HiddenCells, assign_labels, hidden_cells
 from vvgt_cli.conversion.request import file_bytes
 from vvgt_cli.conversion.stages import ViewingConditions
 from vvgt_cli.dvr import RenderSettings

@@ -15,21 +15,19 @@ from tests.test_formats_server import ask
 from tests.test_scale import bodies
 from vvgt_cli.commands.server import Site, served
 from vvgt_cli.commands.viewer import streamed_resources
-from vvgt_cli.conversion.cut import TileGaussians
+from vvgt_cli.conversion.cut import StoredGaussians, TileGaussians, save
 from vvgt_cli.conversion.index import named_files
 from vvgt_cli.conversion.level_selection import SEEN_FROM, VIEW_PIXELS, CutErrors, level_errors
 from vvgt_cli.conversion.levels import WrittenFiles, divide
-from vvgt_cli.conversion.stored import StoredGaussians, save
 from vvgt_cli.defaults import STEPS
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.blocked import Pass
 from vvgt_cli.field.runners import Runner
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply
-from vvgt_cli.gaussians.formats.levels import StreamedLevels
 from vvgt_cli.gaussians.formats.sog import images_of, splats_in
 from vvgt_cli.gaussians.formats.splats import Splats, gaussians_of
-from vvgt_cli.gaussians.formats.streamed import nodes_of, read_manifest
+from vvgt_cli.gaussians.formats.streamed import StreamedLevels, nodes_of, read_manifest
 from vvgt_cli.gaussians.frames import transform, up_matrix
 from vvgt_cli.images import read_png
 
@@ -412,7 +410,7 @@ def test_what_a_camera_is_shown_goes_by_distance(vvgt, folder: Path, tmp_path: P
 def test_only_what_a_camera_is_shown_is_read_and_kept(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     levels, read = StreamedLevels(folder / "lod-meta.json"), []
     counted = lambda meta, image, name: read.append(name) or splats_in(meta, image, name)  # noqa: E731
-    monkeypatch.setattr("vvgt_cli.gaussians.formats.levels.splats_in", counted)
+    monkeypatch.setattr("vvgt_cli.gaussians.formats.streamed.splats_in", counted)
     for distance, shown in ((1e6, {levels.count - 1}), (1e6, set()), (0.0, {0})):
         read.clear()
         seen = levels.seen_from(np.array([0, -distance, 0]), 45.0)

@@ -12,7 +12,7 @@ from tests.refused import refused
 from vvgt_cli.cameras import default_views
 from vvgt_cli.commands.options import TARGETS as NAMES
 from vvgt_cli.conversion.place import headset_axes
-from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
+from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.stages import ViewingConditions
 from vvgt_cli.dvr import RenderSettings, render_view
 from vvgt_cli.errors import UsageError
@@ -60,13 +60,15 @@ def test_what_is_given_wins_over_the_target():
     ("output", "given", "limit"),
     [
         ("a.ply", {}, 20), ("a.html", {}, 20), ("a.html", {"live": True}, 20), ("-", {}, 20), (None, {}, 20),
-        ("a.sog", {}, None), ("a.ply", {"live": True}, None), ("a.ply", {"limits": Limits(max_megabytes=5)}, 5),
+        ("a.sog", {}, None), ("a.ply", {"live": True}, None),
+        ("a.ply", {"fit": FitOptions(10_000_000, target="phone", max_megabytes=5)}, 5),
     ],
 )  # fmt: skip
 def test_the_size_limit_is_of_files_that_have_one(output, given, limit):
-    request = ConvertRequest(SourceRequest(BLOB), output, FitOptions(10_000_000, target="phone"), **given)
+    fit = FitOptions(10_000_000, target="phone")
+    request = ConvertRequest(SourceRequest(BLOB), output, **{"fit": fit} | given)
     assert request.megabytes == limit
-    assert replace(request, shares_output=True).megabytes == request.limits.max_megabytes
+    assert replace(request, shares_output=True).megabytes == request.fit.max_megabytes
     if limit is None:
         assert request.budget() == 10_000_000
     elif output == "a.ply":

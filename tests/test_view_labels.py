@@ -10,7 +10,7 @@ import pytest
 
 from vvgt_cli.commands.converter import Converted, Message, Scored
 from vvgt_cli.commands.converter_process import LoadedVolume, MessageConsole
-from vvgt_cli.commands.live_site import ServedCloud, parse_labels
+from vvgt_cli.commands.live_site import cloud_of, parse_labels
 from vvgt_cli.errors import VvgtError
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.look.labels import distinct
@@ -44,10 +44,10 @@ def test_a_volume_is_converted_for_the_labels_of_the_page(tmp_path: Path, small_
     volume.convert((parse_labels(rows({2: 1.0}), named), None), console)
     _, made, scored = [one for one in told if isinstance(one, Converted | Scored)]
     assert isinstance(made, Converted)
-    gaussians = ServedCloud.of(made.ply, "x").gaussians
+    gaussians, layout = cloud_of(made.ply)
     assert (gaussians.means[:, 0] > -0.2).all()  # one of the eight, to the right
     assert isinstance(scored, Scored)
-    assert ServedCloud.of(made.ply, "x").options.certificate is None
-    assert ServedCloud.of(scored.ply, "x").options.certificate is not None
-    assert json.loads(ServedCloud.of(made.ply, "x").options.legend or "") == {"labels": [["cube 2", "4000ff"]], "of": 1}
+    assert layout.certificate is None
+    assert cloud_of(scored.ply)[1].certificate is not None
+    assert json.loads(layout.legend or "") == {"labels": [["cube 2", "4000ff"]], "of": 1}
     np.testing.assert_allclose(np.median(gaussians.colors, axis=0), (0.25, 0, 1), atol=0.05)

@@ -24,9 +24,9 @@ from tests.test_formats_server import ask, cloud, shown
 from tests.test_live import GRAIN, HI, LO, RAMP, facts
 from tests.test_live import cloud as live_cloud
 from vvgt_cli.commands import viewer as view
-from vvgt_cli.commands.converter import Converted, Converter, Failed, Setup
+from vvgt_cli.commands.converter import Converted, Converter, Failed
 from vvgt_cli.commands.converter_process import hidden
-from vvgt_cli.commands.live_site import PageController, ServedCloud, page_files, plain_name
+from vvgt_cli.commands.live_site import PageController, cloud_of, page_files, plain_name
 from vvgt_cli.commands.server import Resource, Site, served
 from vvgt_cli.conversion import convert_batch
 from vvgt_cli.conversion.request import ConvertRequest
@@ -128,12 +128,12 @@ def test_a_volume_is_shown_and_converted_for_the_pages_function(
         assert header.live is None
         assert header.up == "z"
         status, saved = send(url, "save", {"file": "ply", "number": 4})
-        kept = ServedCloud.of(saved, "x")
+        many, kept = cloud_of(saved)
         assert status == 200
-        assert (kept.options.up, kept.options.unit_distance) == ("none", 0.1)
-        assert kept.options.light == Lighting(True, (), 0.2, 1.0, 0.0, 4.0)
-        assert len(kept.gaussians) == len(shown_now) > 10
-        assert kept.options.certificate is not None
+        assert (kept.up, kept.unit_distance) == ("none", 0.1)
+        assert kept.light == Lighting(True, (), 0.2, 1.0, 0.0, 4.0)
+        assert len(many) == len(shown_now) > 10
+        assert kept.certificate is not None
         assert len(read_html(send(url, "save", {"file": "html", "number": 4})[1], "x")) == len(shown_now)
         page = send(url, "save", {"file": "html", "number": 4, "function": FUNCTION})[1].decode()
         look = json.loads(re.search(r'id="scene">(.*?)</script>', page, re.S)[1])["look"]
@@ -201,7 +201,7 @@ def test_the_process_of_a_server_that_has_ended_removes_its_folder(tmp_path: Pat
         assert process.stdout is not None
         if ready:  # the input stays open: it is the answers that nobody hears
             process.stdout.close()
-            pickle.dump(Setup(SourceRequest("example:blob:12"), "blob", None), process.stdin)
+            pickle.dump((SourceRequest("example:blob:12"), "blob", None), process.stdin)
             pickle.dump((1, None), process.stdin)
             process.stdin.flush()
         else:
@@ -224,10 +224,10 @@ def controller(tmp_path: Path) -> Iterator[tuple[str, PageController]]:
     values = values_of([Layer(Volume(np.zeros((2, 3, 4), np.uint8)), RAMP, 0.5)])
     assert values is not None
     values = values._replace(look=replace(facts(), distance=0.5))
-    cloud = ServedCloud.of(as_ply(hidden((1, 1, 1)), PlyOptions(up="y", scale=0.1, unit_distance=0.5)), "x")
+    ply = as_ply(hidden((1, 1, 1)), PlyOptions(up="y", scale=0.1, unit_distance=0.5))
     found.converter = Still(SourceRequest("none"), "x", found.on_message)
     found.resources["state"] = Resource("application/json", found._state_json)
-    found.on_message(0, Converted(cloud.ply or b"", page_files(cloud, values), values))
+    found.on_message(0, Converted(ply, page_files(*cloud_of(ply), "x", values), values))
     found.state = {"number": 0, "state": "none", "said": ""}
     with served(site) as url:
         yield url, found
@@ -299,7 +299,7 @@ def test_a_light_of_a_page_is_that_of_a_file(controller: tuple[str, PageControll
     _, of = controller
     assert of.first is not None
     assert of.values is not None
-    options, side = of.first().options, Lighting(False, ((0.6, 0.0, 0.8),), 0.2, 0.6, 0.3, 4.0)
+    options, side = of.first(), Lighting(False, ((0.6, 0.0, 0.8),), 0.2, 0.6, 0.3, 4.0)
     base = look_entry(of.values, replace(options, light=side))["light"]
     again = parse_light(base, options)
     assert again is not None

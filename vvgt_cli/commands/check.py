@@ -67,7 +67,7 @@ def check(
     help="RMS error of VOLUME's views (RGBA) that the sampling step is chosen for, default 0.002; or that the pictures "
     "of GAUSSIANS may have, default 0.056 (25 dB).",
 )  # fmt: skip
-@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
+@shared.json_option
 @shared.tf_options
 @shared.light_options
 @shared.read_options

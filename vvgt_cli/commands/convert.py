@@ -90,7 +90,7 @@ def convert(
         UsageError: options contradict each other.
     """
     from vvgt_cli.conversion.convert_batch import convert_all
-    from vvgt_cli.conversion.request import FitOptions, Limits
+    from vvgt_cli.conversion.request import FitOptions
     from vvgt_cli.conversion.result import Conversion
     from vvgt_cli.errors import UsageError
     from vvgt_cli.gaussians import PlyOptions
@@ -104,11 +104,11 @@ def convert(
         raise UsageError(f"--no-values is for a page; got -o {output}; expected -o OUT.html")
     fit = FitOptions.of(
         target, max_gaussians=max_gaussians, screen=screen, init=init, rule=rule, seed=seed, steps=steps, model=model,
-        device=device,
+        device=device, target_psnr=target_psnr, time_budget=time_budget, max_megabytes=max_megabytes,
     )  # fmt: skip
     ply = PlyOptions(frame=frame, camera=camera, sh_degree=sh_degree, comments=comments)
     requests, several = requests_of(
-        volume, look, reading, output=output, fit=fit, limits=Limits(target_psnr, time_budget, max_megabytes), ply=ply,
+        volume, look, reading, output=output, fit=fit, ply=ply,
         up=up, report=report, preview=preview, checkpoint=checkpoint, live=live, values=values, title=title,
         story=None if story is None else read_story(story),
         all_views=all_views, blocks=blocks, overwrite=overwrite, command=command,
@@ -151,7 +151,7 @@ def convert(
 @click.option("--model", metavar="NAME", help="Trained network to run before the steps; discarded if it does not help.")
 @shared.ply_options
 @shared.placed_read_options
-@click.option("--report", metavar="R.json", help="Save times and errors of all stages as JSON; - is standard output.")
+@shared.report_option
 @click.option(
     "--checkpoint", metavar="FOLDER",
     help="Save progress here, so that the same command resumes after an interruption.",

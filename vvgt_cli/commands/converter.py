@@ -81,22 +81,6 @@ class Failed:
 
 Message = ConsoleLine | Progress | Converted | Scored | Failed
 
-
-@dataclass(frozen=True)
-class Setup:
-    """Initial message to the process.
-
-    Attributes:
-        source: the volume, and the first function.
-        name: of what is shown, without ending.
-        memory: limit in bytes (`--memory`).
-    """
-
-    source: SourceRequest
-    name: str
-    memory: int | None
-
-
 # the look to convert for and its light, by default the first ones; None: the page
 Job = tuple[TransferFunction | LabelTable | None, LightOptions | None] | None
 
@@ -180,7 +164,7 @@ class Converter:
             env={**os.environ, "PYTHONPATH": paths, "TMPDIR": folder, "TEMP": folder, "TMP": folder},
         )  # fmt: skip
         with suppress(OSError):
-            pickle.dump(Setup(self._source, self._name, memory_limit()), cast(IO[bytes], self._process.stdin))
+            pickle.dump((self._source, self._name, memory_limit()), cast(IO[bytes], self._process.stdin))
         threading.Thread(target=self._listen, args=(self._process,), daemon=True).start()
         return self._process
 

@@ -11,12 +11,13 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import IO, Any, NoReturn
+from functools import partial
+from typing import IO, NoReturn
 
 import numpy as np
 
-from vvgt_cli.commands.converter import ConsoleLine, Converted, Failed, Job, Message, Progress, Scored, Setup
-from vvgt_cli.commands.live_site import ServedCloud, page_files, stored
+from vvgt_cli.commands.converter import ConsoleLine, Converted, Failed, Job, Message, Progress, Scored
+from vvgt_cli.commands.live_site import cloud_of, page_files, stored
 from vvgt_cli.conversion.convert import convert
 from vvgt_cli.conversion.opened import open_field, ply_options
 from vvgt_cli.conversion.previous_look import PreviousLook
@@ -82,9 +83,9 @@ class LoadedVolume:
         with open_field(Run(console, ConversionReport("view")), request, ()) as field:
             values, self.lighting = field.source.values(), field.source.tf.lighting
             if values is not None and values.look is not None and _missing() is None:
-                ply, corners = ply_options(request, field.source), field.source.volume.unit_frame().half
-                cloud = ServedCloud.of(as_ply(hidden(corners), ply), self.name)
-                console.send(Converted(cloud.ply or b"", page_files(cloud, values), values))
+                corners = field.source.volume.unit_frame().half
+                ply = as_ply(hidden(corners), ply_options(request, field.source))
+                console.send(Converted(ply, page_files(*cloud_of(ply), self.name, values), values))
                 return
         why = _missing() or "its look cannot be changed: colours, or too many labels"
         console.message(f"converted first: {why}")
@@ -117,9 +118,8 @@ class LoadedVolume:
 
     def _with_page(self, conversion: Conversion) -> Converted:
         """Return a conversion with its page: the libraries that a page needs are loaded here already."""
-        cloud = ServedCloud.of(_file(conversion), self.name)
-        assert cloud.ply is not None
-        return Converted(cloud.ply, page_files(cloud, None))
+        ply = _file(conversion)
+        return Converted(ply, page_files(*cloud_of(ply), self.name, None))
 
 
 def hidden(half: Sequence[float]) -> Gaussians:
@@ -156,10 +156,10 @@ def main() -> None:
     orders, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what libraries print
     try:
-        start: Setup = pickle.load(orders)
+        source, name, memory = pickle.load(orders)
     except Exception:
         _exit(folder)
-    set_memory(start.memory)
+    set_memory(memory)
     jobs: list[tuple[int, Job]] = []
     waiting = threading.Semaphore(0)
     threading.Thread(target=_receive, args=(orders, folder, jobs, waiting), daemon=True).start()
@@ -171,11 +171,10 @@ def main() -> None:
         def send(message: Message, number: int = number) -> None:
             _send(answers, folder, (number, message))
 
-        note: Any = _note(send)
-        warnings.showwarning = note
+        warnings.showwarning = partial(_note, send)
         console = MessageConsole(send)
         try:
-            volume = volume or LoadedVolume(start.source, start.name, console)
+            volume = volume or LoadedVolume(source, name, console)
             if job is None:
                 volume.send_page(console)
             else:
@@ -190,9 +189,9 @@ def main() -> None:
             send(Failed(DataError(f"internal: {type(error).__name__}: {error} (a bug)")))
 
 
-def _note(send: Callable[[Message], None]) -> Callable[..., None]:
-    """Return a replacement for `warnings.showwarning` that sends warnings as lines."""
-    return lambda message, *rest: send(ConsoleLine(f"vvgt: note: {message}"))
+def _note(send: Callable[[Message], None], message: object, *rest: object) -> None:
+    """Send a warning as a line, in place of `warnings.showwarning`."""
+    send(ConsoleLine(f"vvgt: note: {message}"))
 
 
 def _plain(error: VvgtError) -> VvgtError:

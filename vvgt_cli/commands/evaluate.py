@@ -74,7 +74,7 @@ def evaluate(
     "--preview", metavar="FILE.png",
     help="Save volume, splats and difference side by side, from the side and close up.",
 )  # fmt: skip
-@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
+@shared.json_option
 @shared.tf_options
 @shared.light_options
 @shared.placed_read_options

@@ -15,14 +15,14 @@ from vvgt_cli.conversion.certify import rounded_error, verify
 from vvgt_cli.conversion.gaussian_files import STDIN, file_rule, layout_of, levels_in_box, open_gaussians
 from vvgt_cli.conversion.place import headset_axes, to_box_frame, upright_axes
 from vvgt_cli.conversion.place import preview as side_by_side
-from vvgt_cli.conversion.recolored import SeveralLooks, apply_function, light_of
+from vvgt_cli.conversion.recolored import apply_function, light_of, looks_of
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.field import Field, Picture
 from vvgt_cli.field.open import FieldNeeds, opened
 from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.field.source import SourceRequest, StyledVolume, tf_record, volume_record
 from vvgt_cli.gaussians import Gaussians, PlyHeader
-from vvgt_cli.gaussians.formats.levels import VIEW, split_name
+from vvgt_cli.gaussians.formats.streamed import VIEW, split_name
 from vvgt_cli.gaussians.outputs import Output, check_outputs
 from vvgt_cli.gaussians.rules import Rule
 from vvgt_cli.gaussians.targets import target_of
@@ -156,10 +156,9 @@ def shown(gaussians: Gaussians, header: PlyHeader, source: StyledVolume, request
             f"{source.name}: {', '.join(shown)}, but the Gaussians carry {', '.join(carried)}; expected the volume and "
             "the --tf, --labels or --layer of the conversion, or none of these options to score the file's own look"
         )
-    looks = SeveralLooks(tuple((layer.tf, layer.unit_distance) for layer in source.layers))
     light = light_of(request.light, source.lighting, source.volume.space)
     options = replace(layout_of(header), unit_distance=source.unit_distance, light=light)
-    return apply_function(gaussians, header, looks if header.live.others else source.tf, options)
+    return apply_function(gaussians, header, looks_of(source), options)
 
 
 def score(

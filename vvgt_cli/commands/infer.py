@@ -61,7 +61,7 @@ def infer(
 @click.option(
     "--provider", type=click.Choice(["cpu", "cuda"]), default="cpu", show_default=True, help="Device for onnxruntime."
 )
-@click.option("--report", metavar="FILE.json", help="Save stages, times and scores as JSON.")
+@shared.report_option
 @shared.overwrite_option
 @shared.common_options
 def command(console: Console, **options: Any) -> None:

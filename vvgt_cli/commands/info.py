@@ -54,7 +54,7 @@ def info(
 @click.argument("file", required=False)
 @click.option("--machine", is_flag=True, help="Describe this machine instead: processors, memory, GPU.")
 @click.option("--sharing", is_flag=True, help="Describe what leaves with a file of Gaussians: names, places, values.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
+@shared.json_option
 @shared.group(
     "optics",
     tf=click.option("--tf", metavar="TF", help="Function to describe a .ply of 'vvgt convert --live' under."),

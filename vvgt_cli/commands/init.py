@@ -51,7 +51,7 @@ def init(
 @shared.overwrite_option
 @shared.ply_options
 @shared.placed_read_options
-@click.option("--report", metavar="R.json", help="Save the times of all stages as JSON; - is standard output.")
+@shared.report_option
 @shared.shared_block_options
 @shared.common_options
 def command(**options: Any) -> None:

@@ -16,28 +16,28 @@ from urllib.parse import unquote
 from vvgt_cli.cameras.files import read_cameras
 from vvgt_cli.conversion.gaussian_files import STDIN, open_gaussians
 from vvgt_cli.conversion.index import is_index, read_index
-from vvgt_cli.conversion.recolored import FunctionRequest, apply_function, resolve_look
+from vvgt_cli.conversion.recolored import recolored
 from vvgt_cli.device import describe as describe_gpu
 from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, SeveralSteps, UsageError, VvgtError
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians import as_ply, describe, read_ply
 from vvgt_cli.gaussians.formats import format_of, is_page, is_splats, read_splats
-from vvgt_cli.gaussians.formats.levels import split_name
 from vvgt_cli.gaussians.formats.page_file import policy
 from vvgt_cli.gaussians.formats.page_values import ELEMENT
-from vvgt_cli.gaussians.formats.streamed import facts_of
+from vvgt_cli.gaussians.formats.streamed import facts_of, split_name
 from vvgt_cli.look import PER_VOXEL, Label
 from vvgt_cli.look.label_files import is_table, labels_of, read_labels
 from vvgt_cli.look.readers import OWN, SUFFIXES
 from vvgt_cli.look.readers.names import names
 from vvgt_cli.resources import free_memory, processors
-from vvgt_cli.volume import ReadOptions
+from vvgt_cli.volume import ReadOptions, Volume
 from vvgt_cli.volume.blocks import Packed
 from vvgt_cli.volume.registry import contents, is_recognised
 from vvgt_cli.volume.space import axis_facts
 
 if TYPE_CHECKING:
     from vvgt_cli.field.layered import OpenedFile
+    from vvgt_cli.field.source import SourceRequest
 
 
 _PLY = (b"ply\n", b"ply\r")
@@ -56,7 +56,7 @@ def machine_facts() -> dict[str, Any]:
     return {"kind": "machine", "processors": processors(), "memory": free, "gpu": describe_gpu()}
 
 
-def inspect(file: str, read: ReadOptions, function: FunctionRequest | None = None) -> dict[str, Any]:
+def inspect(file: str, read: ReadOptions, function: SourceRequest | None = None) -> dict[str, Any]:
     """Return facts about a volume, a transfer function, a view set, a `.ply` or an index; the first is "kind".
 
     With ``function``, live Gaussians are described as they are under it.
@@ -112,12 +112,11 @@ def inspect(file: str, read: ReadOptions, function: FunctionRequest | None = Non
     return _volume(file, read)
 
 
-def _shown(file: str, function: FunctionRequest) -> dict[str, Any]:
+def _shown(file: str, function: SourceRequest) -> dict[str, Any]:
     gaussians, header = open_gaussians(file)
-    tf, options = resolve_look(file, header, function)
-    visible = apply_function(gaussians, header, tf, options)
+    visible, options = recolored(file, gaussians, header, function)
     written = read_ply(io.BytesIO(as_ply(visible, options)))
-    return {"function": tf.name, "hidden": len(gaussians) - len(visible), **describe(*written)}
+    return {"function": options.function, "hidden": len(gaussians) - len(visible), **describe(*written)}
 
 
 def _head_of_stdin() -> bytes:
@@ -200,7 +199,6 @@ def _volume(file: str, read: ReadOptions) -> dict[str, Any]:
 def _choice(file: str, read: ReadOptions, option: str, name: str) -> dict[str, Any]:
     """Describe one of several volumes of a file: size, type, and the range if that is quick to find."""
     from vvgt_cli.field.layered import open_content
-    from vvgt_cli.volume import statistics
 
     facts: dict[str, Any] = {"choice": option, **({"name": name} if name not in ("", option.partition(" ")[2]) else {})}
     read = replace(read, stored=True, packed=True)
@@ -215,11 +213,7 @@ def _choice(file: str, read: ReadOptions, option: str, name: str) -> dict[str, A
             content = open_content(file, replace(read, component=0))
         volume = content.volumes[0]
         facts |= {"dims": volume.dims, "dtype": volume.data.dtype.name}
-        if len(content.volumes) > 1:
-            facts["channels"] = len(content.volumes)
-        elif volume.data.nbytes <= CHEAP:
-            stats = statistics(volume)
-            facts["range"] = [stats.lo, stats.hi]
+        facts |= {"channels": len(content.volumes)} if len(content.volumes) > 1 else _range(volume)
     except VvgtError as error:
         facts["error"] = " ".join(str(error).split())[:200]
     return facts
@@ -227,18 +221,22 @@ def _choice(file: str, read: ReadOptions, option: str, name: str) -> dict[str, A
 
 def _channels(content: OpenedFile) -> list[dict[str, Any]]:
     """Describe each channel of a volume: the option that selects it, its name, colour and range."""
-    from vvgt_cli.volume import statistics
-
     rows = []
     names = content.names or [""] * len(content.volumes)
     for k, name, color, volume in zip(content.numbers, names, content.colors, content.volumes, strict=True):
         shown = [round(v, 4) for v in color]
-        row: dict[str, Any] = {"choice": f"--channel {k}", "name": name, "color": shown}
-        if volume.data.nbytes <= CHEAP:
-            stats = statistics(volume)
-            row["range"] = [stats.lo, stats.hi]
-        rows.append(row)
+        rows.append({"choice": f"--channel {k}", "name": name, "color": shown, **_range(volume)})
     return rows
+
+
+def _range(volume: Volume) -> dict[str, list[float]]:
+    """Return the range of values if it is quick to find."""
+    from vvgt_cli.volume import statistics
+
+    if volume.data.nbytes > CHEAP:
+        return {}
+    stats = statistics(volume)
+    return {"range": [stats.lo, stats.hi]}
 
 
 def _one(file: str, read: ReadOptions) -> dict[str, Any]:

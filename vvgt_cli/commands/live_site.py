@@ -8,7 +8,7 @@ import json
 import re
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from itertools import product
 from pathlib import Path
@@ -44,36 +44,10 @@ def stored(gaussians: Gaussians, options: PlyOptions) -> bytes:
     return as_ply(replace(gaussians, live=None), replace(upright(options), live=None))
 
 
-@dataclass(frozen=True)
-class ServedCloud:
-    """Gaussians that a page shows.
-
-    Attributes:
-        gaussians: in the unit frame.
-        options: how they are written.
-        name: of files to save, without ending.
-        ply: bytes of the file that they were read from; None if they have changed since.
-    """
-
-    gaussians: Gaussians
-    options: PlyOptions
-    name: str
-    ply: bytes | None = None
-
-    @classmethod
-    def of(cls, ply: bytes, name: str) -> ServedCloud:
-        """Read a `.ply`."""
-        gaussians, header = open_gaussians(io.BytesIO(ply))
-        return cls(gaussians, layout_of(header), name, ply)
-
-    def file(self, suffix: str, values: Values | None = None) -> Resource:
-        """Return the file to save, in the format of an ending, a page with the values of the volume."""
-        if (other := format_of(f"x.{suffix}")) is not None:
-            name = f"{self.name}.{suffix}"
-            return Resource(BYTES, lambda: encoded(other, self.gaussians, self.options, name, values))
-        if self.ply is not None:
-            return Resource(BYTES, lambda: self.ply or b"")
-        return Resource(BYTES, lambda: as_ply(self.gaussians, self.options))
+def cloud_of(ply: bytes) -> tuple[Gaussians, PlyOptions]:
+    """Return the Gaussians of a `.ply`, unit frame, and how they are written."""
+    gaussians, header = open_gaussians(io.BytesIO(ply))
+    return gaussians, layout_of(header)
 
 
 def look_of(known: LiveFacts, sent: Mapping[str, Any]) -> LiveFacts:
@@ -119,23 +93,23 @@ def parse_function(sent: Any) -> TransferFunction:
     return tf
 
 
-def page_files(cloud: ServedCloud, values: Values | None) -> dict[str, bytes]:
+def page_files(gaussians: Gaussians, options: PlyOptions, title: str, values: Values | None) -> dict[str, bytes]:
     """Return the text of a page, named "", and the files that it loads; raise DataError if a library is missing.
 
     With the ``values`` of a volume its look can be changed, and one of a single layer is converted for it.
     """
-    file, name = stored(cloud.gaussians, cloud.options), "0.ply"
-    splats, files, more = columns_of(file, cloud.name), {name: file}, dict[str, Any]()
+    file, name = stored(gaussians, options), "0.ply"
+    splats, files, more = columns_of(file, title), {name: file}, dict[str, Any]()
     if values is not None and values.look is not None:
-        look = look_entry(values, cloud.options)
+        look = look_entry(values, options)
         contents = {key: base64.b64encode(content).decode("ascii") for key, content in values.elements.items()}
         files[VALUES] = json.dumps({"facts": values.facts, "contents": contents}).encode()
         more = {
             "values": {"from": VALUES}, "look": look,
-            "server": {"converts": not values.look.others, "name": cloud.name},
+            "server": {"converts": not values.look.others, "name": title},
             "outermost": [[x, y, z] for x, y, z in corners(look)],
         }  # fmt: skip
-    text = page(cloud.name, splats, [{"name": cloud.name, "file": name}], SCRIPT, more)
+    text = page(title, splats, [{"name": title, "file": name}], SCRIPT, more)
     return {"": text.encode("utf-8")} | files
 
 
@@ -161,7 +135,7 @@ class PageController:
         """Create the state of a page without Gaussians."""
         self.resources, self.posts, self.name, self.console = resources, posts, name, console
         self.error: VvgtError | None = None
-        self.first: Callable[[], ServedCloud] | None = None
+        self.first: Callable[[], PlyOptions] | None = None  # how the first page's Gaussians are written
         self.values: Values | None = None
         self.better: bytes | None = None
         self.converter: Converter | None = None
@@ -179,11 +153,11 @@ class PageController:
         with converter.lock:
             converter.submit(None)
 
-    def show(self, cloud: ServedCloud) -> None:
+    def show(self, gaussians: Gaussians, options: PlyOptions) -> None:
         """Show the Gaussians of a file under their own look."""
-        if cloud.gaussians.live is not None:
+        if gaussians.live is not None:
             self.console.message("shown under the file's own look; 'vvgt recolor' shows it under others")
-        self._show(page_files(cloud, None))
+        self._show(page_files(gaussians, options, self.name, None))
 
     def _show(self, files: dict[str, bytes], values: Values | None = None) -> None:
         self.values = values
@@ -242,8 +216,11 @@ class PageController:
             raise DataError("not converted under this look yet; try again when it is")
         if better is None or number != self.state["number"]:
             raise DataError("that conversion was replaced by another; try again")
+        known, name = format_of(f"x.{sent['file']}"), f"{self.name}.{sent['file']}"
+        if known is None:
+            return _resource(better, BYTES)
         values = self.values and self.values._replace(look=look_of(self._look(), sent))
-        return ServedCloud.of(better, self.name).file(sent["file"], values)
+        return _resource(encoded(known, *cloud_of(better), name, values), BYTES)
 
     def _look(self) -> LiveFacts:
         """Return the look that the page began with."""
@@ -256,7 +233,7 @@ class PageController:
         asked = dict(sent) if isinstance(sent, dict) else {}
         light = asked.pop("light", None)
         assert self.first is not None
-        return (None if light is None else (parse_light(light, self.first().options),)), asked
+        return (None if light is None else (parse_light(light, self.first()),)), asked
 
     def on_message(self, number: int, message: Message) -> None:
         """Handle a message of the converter, on its thread."""
@@ -278,7 +255,7 @@ class PageController:
             self._better(number, message)
 
     def _first(self, made: Converted) -> None:
-        self.first = cache(lambda: ServedCloud.of(made.ply, self.name))
+        self.first = cache(lambda: cloud_of(made.ply)[1])
         self._show(made.files, made.values)
         self.state = {"number": 0, "state": "none", "said": ""}
 

@@ -119,7 +119,7 @@ def optimize(
 @click.option(
     "--seed", type=click.IntRange(0), default=0, show_default=True, help="Random seed for the order of views."
 )
-@click.option("--report", metavar="R.json", help="Save times and errors of all stages as JSON; - is standard output.")
+@shared.report_option
 @shared.device_option("steps of --method axes are taken")
 @shared.overwrite_option
 @shared.common_options

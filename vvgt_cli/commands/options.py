@@ -226,6 +226,12 @@ values_option = click.option(
     help="Omit the values from the page (.html) of a volume or a series, and with them slices and changes of its look.",
 )  # fmt: skip
 
+report_option = click.option(
+    "--report", metavar="R.json", help="Save times and errors of all stages as JSON; - is standard output."
+)
+
+json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
+
 overwrite_option = click.option("--overwrite", is_flag=True, help="Overwrite existing files.")
 
 
@@ -401,11 +407,9 @@ def target_option(help: str) -> Callable[[Any], Any]:
     return click.option("--for", "target", type=click.Choice(TARGETS), help=help)
 
 
-def rule_option(help: str, default: str | None = None, more: tuple[str, ...] = ()) -> Callable[[Any], Any]:
+def rule_option(help: str, more: tuple[str, ...] = ()) -> Callable[[Any], Any]:
     """Return the option ``--rule``, which takes the rules and the names of ``more``."""
-    return click.option(
-        "--rule", type=click.Choice([*RULES, *more]), default=default, show_default=default is not None, help=help
-    )
+    return click.option("--rule", type=click.Choice([*RULES, *more]), help=help)
 
 
 limit_options = bundle(

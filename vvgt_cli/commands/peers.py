@@ -7,8 +7,7 @@ import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
-from vvgt_cli.commands.view_files import Layout
-from vvgt_cli.commands.view_sets import camera_views, write_views
+from vvgt_cli.commands.view_sets import Layout, camera_views, write_views
 from vvgt_cli.conversion.gaussian_files import open_gaussians
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.settings import BlockOptions

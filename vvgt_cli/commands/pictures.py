@@ -16,30 +16,30 @@ from vvgt_cli.cameras import Camera, orbit_views
 from vvgt_cli.cameras.boxed import render_in_box, to_box_frame
 from vvgt_cli.cameras.files import read_cameras, transforms_json
 from vvgt_cli.cameras.sets import SIZE
-from vvgt_cli.commands.view_sets import draw_in_blocks
+from vvgt_cli.commands.view_sets import draw_views
 from vvgt_cli.conversion.frames import FrameSeries, is_glob_of_volumes
 from vvgt_cli.conversion.gaussian_files import file_rule, open_gaussians, shown_levels
-from vvgt_cli.conversion.grey import MIP, NAMES, XRAY, Draw, draw_gaussians, grey
 from vvgt_cli.conversion.index import FRAMES, frame_facts, is_pattern, put_name
 from vvgt_cli.conversion.manifest import Shard
-from vvgt_cli.conversion.recolored import FunctionRequest, recolored
+from vvgt_cli.conversion.opened import opened_upright
+from vvgt_cli.conversion.recolored import MIP, NAMES, XRAY, Draw, draw_gaussians, grey, recolored
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError, pip_install
 from vvgt_cli.field.blocked import Blocked
+from vvgt_cli.field.field import Field, Resident
 from vvgt_cli.field.grid import Boxes
-from vvgt_cli.field.open import FieldNeeds, automatic, blocked, store_beside
+from vvgt_cli.field.open import FieldNeeds
 from vvgt_cli.field.rays import HALO
 from vvgt_cli.field.reader import Scalars, VoxelBox
 from vvgt_cli.field.settings import BlockOptions
-from vvgt_cli.field.source import SourceRequest, StyledVolume, describe_source, load
+from vvgt_cli.field.source import SourceRequest, StyledVolume
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians, PlyHeader
-from vvgt_cli.gaussians.formats.levels import by_view
+from vvgt_cli.gaussians.formats.streamed import by_view
 from vvgt_cli.gaussians.frames import upright_matrix
-from vvgt_cli.gaussians.live_facts import shared_facts
 from vvgt_cli.gaussians.outputs import Output, check_folder, check_outputs, write_text
 from vvgt_cli.images.compose import BLACK
-from vvgt_cli.jit.ahead import DRAW, GREATEST, GREY, RAYCAST, for_blocks, for_degree
+from vvgt_cli.jit.ahead import DRAW, GREATEST, GREY, RAYCAST, for_degree
 from vvgt_cli.library.inputs import PathLike
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.tables import Optics, exposed_distance
@@ -47,7 +47,6 @@ from vvgt_cli.progress import Console
 from vvgt_cli.score.record import Run
 from vvgt_cli.volume import Statistics
 from vvgt_cli.volume.readers import is_glob
-from vvgt_cli.volume.space import shear_text
 
 VIEWS_FILE, PICTURE = "transforms.json", ".png"
 Seen = Callable[[Camera], Gaussians]  # what a camera is shown
@@ -66,7 +65,7 @@ class Drawing:
     """
 
     source: tuple[str | None, ...] | SourceRequest
-    function: FunctionRequest | None
+    function: SourceRequest | None
     blocks: BlockOptions | None
     output: str
     camera: PathLike | None
@@ -250,7 +249,7 @@ def _frame(
 
 def _in_range(name: str, header: PlyHeader, first: PlyHeader) -> PlyHeader:
     """Return the header with the histograms of the first file's values, or raise DataError if they differ in range."""
-    if first.live is None or header.live is None or shared_facts([first.live, header.live]) is None:
+    if first.live is None or header.live is None or not first.live.shown_like(header.live):
         raise DataError(
             f"{name}: its values have another range or function than those of the first frame; expected frames that "
             "'vvgt convert --live' makes of one series"
@@ -279,37 +278,19 @@ def _volume(
     run: Run, request: Drawing, asked: SourceRequest, cameras: list[Camera], stack: ExitStack
 ) -> tuple[Draw, str]:
     """Return the ray caster of a volume, in memory or in blocks, and its name; ``stack`` closes the blocks."""
-    from vvgt_cli.dvr import RenderSettings, render_view
+    from vvgt_cli.dvr import RenderSettings
 
-    settings, options, field = RenderSettings(), request.blocks or automatic(asked, run.console), None
-    if options is not None:
-        needs = FieldNeeds(1, cameras[0].height, values=request.rule == XRAY)
-        field = stack.enter_context(blocked(run, asked, options, stack.enter_context(store_beside(None)), needs))
-        source = field.source
-    else:
-        with run.stage("read") as stage:
-            source = load(asked)
-            stage.note = describe_source(source)
-    if source.volume.sheared:  # no pinhole camera sees it
-        text = shear_text(source.volume.axes)
-        raise DataError(f"{source.volume.name}: {text}; expected right angles: 'vvgt convert' accepts it")
-    where = " in blocks" if field else ""
-    if request.rule == MIP:
-        run.compile(GREATEST, source.kernel_type())
-        return render_in_box(mip_of(field or source), source.volume.axes), f"MIP{where}"
-    if request.rule == XRAY:
-        source = as_xray(source)
-        field = field and field.with_look(source)
-    kernels = source.kernels(RAYCAST)
-    run.compile(for_blocks(kernels) if field else kernels, source.kernel_type())
-    if field:
-        draw = draw_in_blocks(field, settings, cameras)
-    else:
-        scene = source.scene()
-        draw = render_in_box(lambda camera: render_view(scene, camera, settings), source.volume.axes)
-    if request.rule == XRAY:
-        return lambda camera: grey(draw(camera)[..., 3]), f"X-ray{where}"
-    return draw, f"ray casting{where}"
+    mip, xray = request.rule == MIP, request.rule == XRAY
+    needs, kernels = FieldNeeds(1, cameras[0].height, values=xray), GREATEST if mip else RAYCAST
+    look: dict[str, Any] = {"look": as_xray} if xray else {}
+    field = stack.enter_context(opened_upright(run, asked, request.blocks, needs, kernels, **look))
+    where = " in blocks" if isinstance(field, Blocked) else ""
+    if mip:
+        return render_in_box(mip_of(field), field.source.volume.axes), f"MIP{where}"
+    if xray and isinstance(field, Blocked):
+        field = field.with_look(field.source)
+    draw = draw_views(field, RenderSettings(), cameras)
+    return ((lambda camera: grey(draw(camera)[..., 3])), f"X-ray{where}") if xray else (draw, f"ray casting{where}")
 
 
 def _opened(request: Drawing, name: str, first: PlyHeader | None) -> tuple[Seen, Gaussians, PlyHeader]:
@@ -320,10 +301,11 @@ def _opened(request: Drawing, name: str, first: PlyHeader | None) -> tuple[Seen,
         gaussians, header = open_gaussians(name, empty=several)
         if first is not None and (request.rule in NAMES or request.function is not None):
             header = _in_range(name, header, first)
-        gaussians = recolored(name, gaussians, header, function, empty=several)
+        if function is not None:
+            gaussians, _ = recolored(name, gaussians, header, function, empty=several)
         return lambda camera: gaussians, gaussians, header
     seen, coarsest, header = shown_levels(manifest)
-    return seen, recolored(name, coarsest, header, function), header
+    return seen, coarsest if function is None else recolored(name, coarsest, header, function)[0], header
 
 
 def _pictures(request: Drawing, pictures: Iterator[np.ndarray], cameras: list[Camera]) -> str:
@@ -361,20 +343,19 @@ def as_xray(source: StyledVolume) -> StyledVolume:
     return replace(source, layers=(replace(layer, unit_distance=distance),), lighting=None)
 
 
-def mip_of(field: Blocked | StyledVolume) -> Draw:
-    """Return the function that draws the MIP of a volume in blocks or in memory, for cameras in its box frame.
+def mip_of(field: Field) -> Draw:
+    """Return the function that draws the MIP of a volume, for cameras in its box frame.
 
     Raises:
         UsageError: labels, channels or layers.
     """
-    source = field.source if isinstance(field, Blocked) else field
+    source = field.source
     source.require_scalar_field()
     if isinstance(field, Blocked):
         return lambda camera: grey(_greatest(source, _blocks(field), camera))
-    from vvgt_cli.dvr.scene import kernel_values
-
-    values, slope, intercept = kernel_values(source.volume)
-    whole = VoxelBox(values, None, _of_range(source.overall, slope, intercept), np.zeros(3, np.int64))
+    assert isinstance(field, Resident)
+    optics = _of_range(source.overall, field.layout.slope, field.layout.intercept)
+    whole = VoxelBox(field.layout.values, None, optics, np.zeros(3, np.int64))
     part = whole, whole.begin, np.array(source.volume.dims)
     return lambda camera: grey(_greatest(source, [part], camera))
 

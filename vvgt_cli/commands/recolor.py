@@ -49,13 +49,14 @@ def recolor(
     from dataclasses import replace
 
     from vvgt_cli.conversion.gaussian_files import open_gaussians
-    from vvgt_cli.conversion.recolored import FunctionRequest, apply_function, layer_look, resolve_look
+    from vvgt_cli.conversion.recolored import layer_look, recolored
     from vvgt_cli.conversion.result import Result
+    from vvgt_cli.field.source import SourceRequest
     from vvgt_cli.gaussians.formats import SUFFIXES
     from vvgt_cli.library.inputs import Look, live_look, written
 
     name, listed = os.fspath(ply), () if isinstance(layers, Mapping) else layers
-    look = live_look(Look(tf, tf_range, opacity_unit_distance, light, labels, listed, iso)) or FunctionRequest()
+    look = live_look(Look(tf, tf_range, opacity_unit_distance, light, labels, listed, iso)) or SourceRequest("")
 
     def make(run: Run) -> Result:
         with run.stage("read") as stage:
@@ -64,9 +65,8 @@ def recolor(
         with run.stage("recolor") as stage:
             own = layers.items() if isinstance(layers, Mapping) else ()
             named = tuple(layer_look(header, key, one) for key, one in own)
-            shown, options = resolve_look(name, header, replace(look, layers=look.layers + named))
-            visible = apply_function(gaussians, header, shown, options)
-            stage.note = f"{len(visible)} of them visible under {shown.name}"
+            visible, options = recolored(name, gaussians, header, replace(look, layers=look.layers + named))
+            stage.note = f"{len(visible)} of them visible under {options.function}"
         return Result(visible, run.report, options)
 
     inputs = [name, *look.paths()]

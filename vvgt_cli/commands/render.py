@@ -12,7 +12,6 @@ from vvgt_cli.commands import options as shared
 from vvgt_cli.errors import UsageError
 
 if TYPE_CHECKING:
-    from vvgt_cli.conversion.recolored import FunctionRequest
     from vvgt_cli.field.settings import BlockOptions
     from vvgt_cli.field.source import SourceRequest
     from vvgt_cli.library.inputs import LookLike, PathLike, Reading, VolumeLike
@@ -57,7 +56,7 @@ def render(
         raise UsageError(f"--background {' '.join(map(str, background))}: expected three numbers in [0, 1]")
     frames = movie_frames(os.fspath(file)) if isinstance(file, str | os.PathLike) else ()
     given: tuple[str | None, ...] | SourceRequest = frames
-    function: FunctionRequest | None = None
+    function: SourceRequest | None = None
     if any(map(is_splats, filter(None, frames))) or (file == "-" and reading.get("dims") is None):
         if source_of(file, None, reading).read != ReadOptions() or blocks is not None:
             raise UsageError(f"{file} holds Gaussians; reading options and --blocks are for volumes only: omit them")

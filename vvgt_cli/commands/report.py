@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Unpack
 
@@ -53,16 +52,15 @@ def report(
         UsageError, DataError: see `convert`.
     """
     from vvgt_cli.commands.peers import Peer
-    from vvgt_cli.commands.report_runs import RunOptions, report_on
-    from vvgt_cli.library.inputs import blocks_of, console_of, source_of
+    from vvgt_cli.commands.report_runs import report_on
+    from vvgt_cli.conversion.request import FitOptions
+    from vvgt_cli.library.inputs import console_of, requests_of
 
-    runs = RunOptions(
-        max_gaussians, screen, tuple(steps), model, seed, blocks_of(blocks), peers=tuple(map(Peer.of, peers))
+    fit = FitOptions(max_gaussians, screen, seed=seed, model=model)
+    requests, _ = requests_of(
+        volume, look, reading, output=output, fit=fit, blocks=blocks, overwrite=overwrite, command=command
     )
-    return report_on(
-        source_of(volume, look, reading), os.fspath(output), runs, picture_size=picture_size, overwrite=overwrite,
-        command=command, console=console_of(progress),
-    )  # fmt: skip
+    return report_on(requests[""], steps, [Peer.of(one) for one in peers], picture_size, console_of(progress))
 
 
 @shared.command("report", short_help="Plot error against run time, as an HTML page and tables.")

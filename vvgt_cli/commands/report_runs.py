@@ -10,29 +10,28 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from vvgt_cli.cameras import Camera, default_views
-from vvgt_cli.cameras.blocks import Blocks, spread_blocks
 from vvgt_cli.cameras.boxed import render_in_box
 from vvgt_cli.commands.peers import Peer, PeerViews, train
 from vvgt_cli.conversion.convert import convert
 from vvgt_cli.conversion.live import live_refusal
 from vvgt_cli.conversion.opened import open_field
+from vvgt_cli.conversion.previous_frame import RememberedViews
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.stages.refinement import refine
 from vvgt_cli.conversion.stages.views import CheckViews, TrainingViews, view_count
-from vvgt_cli.defaults import MAX_GAUSSIANS, REPORT_STEPS, SIZE
+from vvgt_cli.defaults import REPORT_STEPS
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.field import Field, Picture, Resident
-from vvgt_cli.field.settings import BlockOptions
-from vvgt_cli.field.source import SourceRequest, tf_record, volume_record
+from vvgt_cli.field.source import tf_record, volume_record
 from vvgt_cli.field.workload import view_edge
 from vvgt_cli.gaussians import Gaussians, as_stored, read_ply, write_ply
 from vvgt_cli.gaussians.frames import transform
-from vvgt_cli.gaussians.outputs import STDOUT, Output, check_outputs, write_text
+from vvgt_cli.gaussians.outputs import STDOUT, Output, check_folder, check_outputs, write_text
 from vvgt_cli.gaussians.rules import INRIA
 from vvgt_cli.images import png_bytes
 from vvgt_cli.jit.ahead import INIT
@@ -55,43 +54,14 @@ from vvgt_cli.score.curves import (
 from vvgt_cli.score.page import Pictures, page
 from vvgt_cli.score.record import ConversionReport, Run, document
 from vvgt_cli.score.viewing import SIDE, ConditionView, condition_pictures, condition_views, score_conditions, screens
-from vvgt_cli.score.views import WHOLE, Views, render_check_views, score_drawn_view
+from vvgt_cli.score.views import WHOLE, Views, render_check_views, score_test_views, scored_views
 from vvgt_cli.volume.blocks import check_memory
-
-if TYPE_CHECKING:
-    from vvgt_cli.images.metrics import Scores
-
 
 SHARES = (64, 16, 4)  # of the budget, for the closed form at several K
 STARTS = 2  # of the budget, what the baselines begin with: they grow
 FAINT = 0.1  # opacity of 3DGS' first points
 PICTURED = (0, 4)  # test views on the page: from above, from the side
 NEIGHBOURS = 0.72  # mean distance to the three nearest of n random points, over (volume / n)^(1/3)
-
-
-@dataclass(frozen=True)
-class RunOptions:
-    """Options of the runs.
-
-    Attributes:
-        max_gaussians: largest budget K.
-        screen: pixels along the edge of the screen that files are made for and scored on.
-        steps: lengths of gradient descent, one run each; the baselines take the longest.
-        model: folder or name of an exported network, None for none.
-        seed: random seed.
-        blocks: how the volume is processed in blocks; None: in memory, or in blocks if it is large.
-        live: include the live form (docs/live.md), which not every scene has.
-        peers: other trainers, one run each.
-    """
-
-    max_gaussians: int = MAX_GAUSSIANS
-    screen: int = SIZE
-    steps: tuple[int, ...] = REPORT_STEPS
-    model: str | None = None
-    seed: int = 0
-    blocks: BlockOptions | None = None
-    live: bool = False
-    peers: tuple[Peer, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -114,172 +84,148 @@ class PlannedRun:
     peer: Peer | None = None
 
 
-def plan_runs(options: RunOptions) -> list[PlannedRun]:
-    """List the runs: other trainers first, as they may fail; then ours from the cheapest on; then the baselines."""
-    most, size, seed = options.max_gaussians, options.screen, options.seed
+def plan_runs(
+    fit: FitOptions, steps: Sequence[int] = REPORT_STEPS, peers: Sequence[Peer] = (), live: bool = False
+) -> list[PlannedRun]:
+    """List the runs: other trainers first, as they may fail; then ours from the cheapest on; then the baselines.
+
+    Args:
+        fit: largest budget K, screen, seed, and the network, None for none.
+        steps: lengths of gradient descent, one run each; the baselines take the longest.
+        peers: other trainers, one run each.
+        live: include the live form (docs/live.md), which not every scene has.
+    """
+    most, form = fit.max_gaussians, replace(fit, steps=0, model=None)
     budgets = sorted({max(most // share, 1) for share in SHARES} | {most})
     runs = [
-        PlannedRun(f"closed form, K = {short(k)}", short(k), "closed form", FitOptions(k, size, seed=seed, steps=0))
+        PlannedRun(f"closed form, K = {short(k)}", short(k), "closed form", replace(form, max_gaussians=k))
         for k in budgets
     ]
-    if options.live:
-        runs.append(PlannedRun(f"live form, K = {short(most)}", "live", "live", FitOptions(most, size, seed=seed)))
-    if options.model:
-        fit = FitOptions(most, size, seed=seed, steps=0, model=options.model)
-        runs.append(PlannedRun(f"network {Path(options.model).name}", "network", "network", fit))
-    for steps in sorted(set(options.steps)):
-        fit = FitOptions(most, size, seed=seed, steps=steps)
-        runs.append(PlannedRun(f"{steps} steps", f"{steps} steps", "steps", fit))
-    most_steps = max(options.steps, default=0)
-    longest = FitOptions(most, size, seed=seed, steps=most_steps)
-    if most_steps:
+    if live:
+        runs.append(PlannedRun(f"live form, K = {short(most)}", "live", "live", replace(form, steps=None)))
+    if fit.model:
+        runs.append(PlannedRun(f"network {Path(fit.model).name}", "network", "network", replace(fit, steps=0)))
+    runs += [PlannedRun(f"{n} steps", f"{n} steps", "steps", replace(form, steps=n)) for n in sorted(set(steps))]
+    longest = replace(form, steps=max(steps, default=0))
+    if longest.steps:
         for name, start in (("3DGS", "points"), ("iVR-GS setting", "samples")):
-            runs.append(PlannedRun(f"{name}, {most_steps} steps", name, "baseline", longest, start))
-    return [PlannedRun(peer.name, peer.name, "peer", longest, peer=peer) for peer in options.peers] + runs
+            runs.append(PlannedRun(f"{name}, {longest.steps} steps", name, "baseline", longest, start))
+    return [PlannedRun(peer.name, peer.name, "peer", longest, peer=peer) for peer in peers] + runs
 
 
 @dataclass(frozen=True)
 class Reference:
-    """Reference that every run is scored against: test views, rendered once and counted in no run's time.
+    """Reference that every run is scored against, as `vvgt evaluate` draws it; it counts in no run's time.
 
     Attributes:
-        cameras: of the views; ``blocks`` of each that are scored, None for the whole view.
-        images: (h, w, 4) float32 each; of views that are not in `WHOLE` only the blocks are drawn.
-        step: sampling distance, voxels; ``rays`` the largest number per pixel.
+        views: the test views, which are rendered once.
+        size: pixels along their edge.
         axes: (3, 3) `Volume.axes`: from the box frame, in which the views are, to the unit frame.
-        shown: images as `upright` makes them.
         conditions: views at the size made for, and at the next larger.
     """
 
-    cameras: list[Camera]
-    blocks: list[Blocks | None]
-    images: list[np.ndarray]
-    step: float
-    rays: int
+    views: RememberedViews
+    size: int
     axes: np.ndarray
-    shown: list[np.ndarray]
     conditions: list[ConditionView]
 
     @classmethod
     def render(cls, volume: Field, size: int, console: Console) -> Reference:
-        """Render the test views, as `vvgt evaluate` draws them."""
+        """Render the test views."""
         from vvgt_cli.dvr import REFERENCE
 
-        cameras, axes = default_views("test", size=size), volume.source.volume.axes
-        blocks = [spread_blocks(size, size, i) for i in range(len(cameras))]
-        around = condition_pictures(screens(size), SIDE)
-        volume.views.expect([Picture(camera, REFERENCE, _drawn(blocks, i)) for i, camera in enumerate(cameras)])
-        volume.views.expect([Picture(camera, REFERENCE, part) for _, camera, part in around])
-        images, bar = [], console.bar("reference")
-        for i, camera in enumerate(cameras):
-            images.append(volume.views.view(camera, REFERENCE, _drawn(blocks, i)))
+        views, around = RememberedViews(size, volume.views), condition_pictures(screens(size), SIDE)
+        scored = [Picture(camera, REFERENCE, blocks) for _, camera, blocks in scored_views(size, perceptual=True)]
+        volume.views.expect([*scored, *(Picture(camera, REFERENCE, part) for _, camera, part in around)])
+        bar = console.bar("reference")
+        for done, picture in enumerate(scored, 1):
+            views.view(*picture)
             if bar:
-                bar(i + 1, len(cameras))
-        shown = upright(images, cameras, axes, lambda camera: volume.views.view(camera, REFERENCE))
+                bar(done, len(scored))
         conditions = list(condition_views(volume.views, around, REFERENCE))
-        rays = max(rays for _, rays in REFERENCE.tiers)
-        return cls(cameras, blocks, images, REFERENCE.step, rays, axes, shown, conditions)
+        return cls(views, size, volume.source.volume.axes, conditions)
 
     def psnr_of(self, renderer: str, field: Field) -> float | None:
         """Return another renderer's mean PSNR on the views that are drawn whole, None if it cannot draw them."""
+        from vvgt_cli.dvr import REFERENCE
         from vvgt_cli.dvr.backends import view_renderer
         from vvgt_cli.images.metrics import score_view
         from vvgt_cli.volume.vtk.messages import quiet_vtk
 
         if not isinstance(field, Resident):
             return None
+        cameras = [default_views("test", size=self.size)[n] for n in WHOLE]
         try:
             with quiet_vtk():  # which says where it looked for a screen
                 draw = view_renderer(renderer, field.scene)
-                scores = [score_view(self.images[i], draw(self.cameras[i]), perceptual=False).psnr for i in WHOLE]
+                pairs = [(self.views.view(camera, REFERENCE), draw(camera)) for camera in cameras]
         except (DataError, UsageError):
             return None
-        return float(np.mean(scores))
+        return float(np.mean([score_view(*pair, perceptual=False).psnr for pair in pairs]))
 
-    def score(self, gaussians: Gaussians) -> tuple[Scores, list[np.ndarray]]:
-        """Return scores as `vvgt evaluate` measures them, and the images of the Gaussians."""
-        from vvgt_cli.images.metrics import mean_scores
-        from vvgt_cli.splat import render
+    def score(self, gaussians: Gaussians, report: ConversionReport) -> None:
+        """Set the scores of Gaussians in their report as `vvgt evaluate` measures them."""
+        from vvgt_cli.dvr import REFERENCE
 
-        ours, scores = [], []
-        for i, camera in enumerate(self.cameras):
-            drawn = _drawn(self.blocks, i)
-            ours.append(render(gaussians, camera, blocks=drawn))
-            scores.append(score_drawn_view(self.images[i], ours[i], self.blocks[i], drawn is None))
-        return mean_scores(scores), ours
+        report.scores = asdict(score_test_views(self.views, gaussians, self.size, REFERENCE))
+        report.conditions = [asdict(one) for one in score_conditions(gaussians, self.conditions)]
 
-
-def _drawn(blocks: Sequence[Blocks | None], view: int) -> Blocks | None:
-    """Return the blocks of a test view that are drawn, None for all of it."""
-    return None if view in WHOLE else blocks[view]
-
-
-def upright(
-    images: np.ndarray | Sequence[np.ndarray],
-    cameras: Sequence[Camera],
-    axes: np.ndarray,
-    draw: Callable[[Camera], np.ndarray],
-) -> list[np.ndarray]:
-    """Return box-frame images for people: the `PICTURED` ones are redrawn in the unit frame if it differs."""
-    if np.array_equal(axes, np.eye(3)):
-        return list(images)
-    see = render_in_box(draw, axes)
-    return [see(cameras[n]) if n in PICTURED else image for n, image in enumerate(images)]
+    def pictures(self, draw: Callable[[Camera], np.ndarray], limit: int) -> list[bytes]:
+        """Return PNG of the `PICTURED` views, upright, over black, averaged down to sides of at most ``limit``."""
+        see, shown = render_in_box(draw, self.axes), []
+        for n in PICTURED:
+            image = np.clip(see(default_views("test", size=self.size)[n])[..., :3], 0, 1)
+            factor = -(-self.size // limit)
+            side = self.size // factor
+            squares = image[: side * factor, : side * factor].reshape(side, factor, side, factor, 3)
+            shown.append(png_bytes(squares.mean(axis=(1, 3))))
+        return shown
 
 
 def do_runs(
-    source: SourceRequest, options: RunOptions, reference: Reference, console: Console
-) -> Iterator[tuple[dict[str, Any], list[np.ndarray]]]:
-    """Yield each run (a dict, see `vvgt_cli.score.curves`) and its images of the reference's views.
+    request: ConvertRequest, planned: Sequence[PlannedRun], reference: Reference
+) -> Iterator[tuple[dict[str, Any], Gaussians]]:
+    """Yield each run (a dict, see `vvgt_cli.score.curves`) and its Gaussians, box frame.
 
     Raises:
         DataError, UsageError: as `vvgt_cli.conversion.convert.convert`.
         KeyboardInterrupt: a refinement was interrupted; later runs would not be comparable.
     """
-    from vvgt_cli.splat import render
-
     with tempfile.TemporaryDirectory() as folder:
         views = None
-        if options.peers:  # as many as our longest run has, at the screen's size
-            count = view_count(max(options.steps, default=0), small=False)
-            views = PeerViews.render(source, Path(folder) / "views", count, options.screen, options.blocks)
-        for planned in plan_runs(options):
-            report, gaussians = _run(source, planned, reference.axes, options.blocks, views)
-            if report.refinement and report.refinement["reason"] == "interrupted":
+        if any(one.peer for one in planned):  # as many as our longest run has, at the screen's size
+            count = view_count(max(one.fit.steps or 0 for one in planned), small=False)
+            views = PeerViews.render(request.source, Path(folder) / "views", count, request.fit.screen, request.blocks)
+        for one in planned:
+            report, gaussians = _run(request, one, reference.axes, views)
+            if report.interrupted:
                 raise KeyboardInterrupt
-            scores, images = reference.score(gaussians)
-            conditions = score_conditions(gaussians, reference.conditions)
-            report.scores, report.conditions = asdict(scores), [asdict(condition) for condition in conditions]
-            count = views.count if views is not None and planned.peer is not None else _views_of(report, planned.fit)
-            run = {"name": planned.name, "label": planned.label, "kind": planned.kind, "views": count}
-            run |= asdict(report)
-            yield run, upright(images, reference.cameras, reference.axes, partial(render, gaussians))
+            reference.score(gaussians, report)
+            count = views.count if views is not None and one.peer is not None else _views_of(report, one.fit)
+            yield {"name": one.name, "label": one.label, "kind": one.kind, "views": count} | asdict(report), gaussians
 
 
-def warm_up(source: SourceRequest, options: RunOptions) -> None:
+def warm_up(request: ConvertRequest, fit: FitOptions, steps: Sequence[int], live: bool) -> None:
     """Run every kind of run once at a tiny size, so that kernels are compiled or loaded before any clock starts."""
-    few = RunOptions(100, 64, (2,) if options.steps else (), options.model, options.seed, live=options.live)
-    for planned in plan_runs(few)[-5:]:
-        _run(source, planned, np.eye(3), options.blocks)
+    few = replace(fit, max_gaussians=100, screen=64)
+    for planned in plan_runs(few, (2,) if steps else (), (), live)[-5:]:
+        _run(request, planned, np.eye(3))
 
 
 def _run(
-    source: SourceRequest,
-    planned: PlannedRun,
-    axes: np.ndarray,
-    blocks: BlockOptions | None,
-    views: PeerViews | None = None,
+    request: ConvertRequest, planned: PlannedRun, axes: np.ndarray, views: PeerViews | None = None
 ) -> tuple[ConversionReport, Gaussians]:
     """Do one run; return its report and its Gaussians in the box frame (``axes`` as in `Reference`)."""
     if planned.kind == "baseline":
-        return _baseline(source, planned, blocks)
+        return _baseline(replace(request, fit=planned.fit), planned.start == "points")
     if planned.peer is not None and views is not None:
         report, gaussians = train(planned.peer, views)
         return report, transform(gaussians, np.linalg.inv(axes))
     with tempfile.TemporaryDirectory() as folder:
-        path, live = str(Path(folder) / "run.ply"), planned.kind == "live"
-        request = ConvertRequest(source, path, planned.fit, up="none", blocks=blocks, live=live)
-        report = convert(request, Console(quiet=True)).report
+        path = str(Path(folder) / "run.ply")
+        report = convert(
+            replace(request, output=path, fit=planned.fit, up="none", live=planned.kind == "live"), Console(quiet=True)
+        ).report
         return report, transform(read_ply(path)[0], np.linalg.inv(axes))
 
 
@@ -311,19 +257,16 @@ def _finish(run: Run, gaussians: Gaussians) -> tuple[ConversionReport, Gaussians
     return run.finish(), stored
 
 
-def _baseline(
-    source: SourceRequest, planned: PlannedRun, blocks: BlockOptions | None
-) -> tuple[ConversionReport, Gaussians]:
+def _baseline(request: ConvertRequest, points: bool) -> tuple[ConversionReport, Gaussians]:
     """Run 3DGS (Kerbl et al. 2023): its loss, rates and density control, from random points or volume samples."""
     from vvgt_cli.closed_form import VbmOptions
 
-    run, fit = Run(Console(quiet=True), ConversionReport("report")), planned.fit
+    run, fit = Run(Console(quiet=True), ConversionReport("report")), request.fit
     count = max(fit.max_gaussians // STARTS, 1)
-    with open_field(run, ConvertRequest(source, fit=fit, blocks=blocks), INIT) as volume:
+    with open_field(run, request, INIT) as volume:
         with run.stage("samples"):
-            if planned.start == "points":
-                half = np.array(volume.source.volume.unit_frame().half)
-                start = random_points(half, count, fit.seed)
+            if points:
+                start = random_points(np.array(volume.source.volume.unit_frame().half), count, fit.seed)
             else:
                 start = volume.pyramid(VbmOptions(count, fit.screen, "uniform", fit.seed)).gaussians
         train, check = _views(run, volume, fit)
@@ -350,88 +293,87 @@ def random_points(half: np.ndarray, count: int, seed: int) -> Gaussians:
     )
 
 
-def pictures(images: Sequence[np.ndarray] | np.ndarray, numbers: Sequence[int], limit: int) -> list[np.ndarray]:
-    """Return RGB over black of some views, (h, w, 3) in [0, 1], averaged down to sides of at most ``limit``."""
-    shown = []
-    for n in numbers:
-        image = np.clip(images[n][..., :3], 0, 1)
-        factor = -(-max(image.shape[:2]) // limit)
-        height, width = (side // factor for side in image.shape[:2])
-        squares = image[: height * factor, : width * factor].reshape(height, factor, width, factor, 3)
-        shown.append(squares.mean(axis=(1, 3)))
-    return shown
-
-
 PAGE, TABLE, DATA = "report.html", "report.csv", "report.json"
 VIEWS, VIEW_BYTES = 24, 16  # test views, ours and those shown; a pixel: float32 RGBA
 
 
 def report_on(
-    source: SourceRequest, output: str, options: RunOptions, *, picture_size: int, overwrite: bool, command: str | None,
-    console: Console,
-) -> dict[str, Any]:  # fmt: skip
+    request: ConvertRequest, steps: Sequence[int], peers: Sequence[Peer], picture_size: int, console: Console
+) -> dict[str, Any]:
     """Do all runs, write `report.json`, `report.csv`, the plots and `report.html`, and return the JSON's content.
 
-    ``picture_size`` is the largest edge of the page's pictures, in pixels, and ``command`` what the user typed.
+    Args:
+        request: for the folder as output; `fit` and `steps` as in `plan_runs`, without a network the shipped one.
+        steps: see `plan_runs`.
+        peers: other trainers.
+        picture_size: largest edge of the page's pictures, in pixels.
+        console: for messages.
 
     Raises:
         UsageError: an output that may not be written, or standard input as the volume, which every run reads again.
         DataError: invalid input.
     """
-    if source.volume == STDOUT:
+    from vvgt_cli.dvr import REFERENCE
+    from vvgt_cli.splat import render
+
+    if request.source.volume == STDOUT:
         raise UsageError("VOLUME is '-', but every run reads it again; expected a file")
-    folder = _folder(output, (DATA, TABLE, PAGE, *FILES), overwrite)
-    options, size = _with_model(options), options.screen
+    folder = _folder(str(request.output), (DATA, TABLE, PAGE, *FILES), request.overwrite)
+    fit, size = _with_model(request.fit), request.fit.screen
     check_memory(VIEWS * size**2 * VIEW_BYTES, f"--screen {size}: test views and ours", "try a smaller --screen")
-    whole = ConvertRequest(source, fit=FitOptions(options.max_gaussians, size), blocks=options.blocks)
-    with open_field(Run(console, ConversionReport("report")), whole, INIT) as volume:
+    alone = ConvertRequest(request.source, fit=replace(fit, model=None), blocks=request.blocks)
+    with open_field(Run(console, ConversionReport("report")), alone, INIT) as volume:
         scene = volume.source
-        options = replace(options, live=live_refusal(replace(whole, live=True), scene) is None)
-        warm_up(source, options)
+        live = live_refusal(replace(alone, live=True), scene) is None
+        warm_up(alone, fit, steps, live)
         reference = Reference.render(volume, size, console)
         ceiling = reference.psnr_of("vtk", volume)
-    runs, ours = [], []
-    total = len(plan_runs(options))
-    for run, images in do_runs(source, options, reference, console):
+        shown = reference.pictures(lambda camera: reference.views.view(camera, REFERENCE), picture_size)
+    runs, ours, planned = [], [], plan_runs(fit, steps, peers, live)
+    for run, gaussians in do_runs(alone, planned, reference):
         runs.append(run)
-        ours.append(list(map(png_bytes, pictures(images, PICTURED, picture_size))))
+        ours.append(reference.pictures(partial(render, gaussians), picture_size))
         score = f"PSNR {psnr(run):.2f} dB, worst condition {worst_condition(run):.2f} dB"
         megabytes = f"{run['gaussians']} Gaussians, {run['bytes'] / 1e6:.1f} MB"
-        console.stage(f"{len(runs)}/{total}", cost(run), f"{run['name']}: {score}, {megabytes}")
-    best, bend = [run["name"] for run in pareto(runs)], knee(runs)
+        console.stage(f"{len(runs)}/{len(planned)}", cost(run), f"{run['name']}: {score}, {megabytes}")
+    bend = knee(runs)
     content = {
-        "command_line": command or "",
+        "command_line": request.command or "",
         "volume": volume_record(scene),
-        "transfer_function": tf_record(scene, source),
-        "options": asdict(options),
-        "reference": {"views": len(reference.cameras), "size": size, "step": reference.step, "rays": reference.rays},
-        "front": best,
+        "transfer_function": tf_record(scene, request.source),
+        "options": {
+            "max_gaussians": fit.max_gaussians, "screen": size, "steps": steps, "model": fit.model, "seed": fit.seed,
+            "blocks": request.blocks, "live": live, "peers": peers,
+        },
+        "reference": {
+            "views": len(default_views("test")), "size": size, "step": REFERENCE.step,
+            "rays": max(rays for _, rays in REFERENCE.tiers),
+        },
+        "front": [run["name"] for run in pareto(runs)],
         "knee": bend["name"] if bend else None,
         "unit_costs": unit_costs(runs),
         "runs": [run | {"cost": cost(run)} for run in runs],
         "vtk_psnr": ceiling,
-    }
+    }  # fmt: skip
     text = document("vvgt-report", content)
     report: dict[str, Any] = json.loads(text)
-    series = [ReportRuns(scene.volume.name, runs, report)]
-    shown = list(map(png_bytes, pictures(reference.shown, PICTURED, picture_size)))
     folder.mkdir(exist_ok=True)
-    write_text(str(folder / DATA), text, overwrite)
-    title = f"Error against run time: {scene.volume.name}"
-    _write(folder, series, title, Pictures(list(PICTURED), shown, ours), overwrite)
+    write_text(str(folder / DATA), text, request.overwrite)
+    series, title = [ReportRuns(scene.volume.name, runs, report)], f"Error against run time: {scene.volume.name}"
+    _write(folder, series, title, Pictures(list(PICTURED), shown, ours), request.overwrite)
     console.message(f"{folder / PAGE}")
     return report
 
 
-def _with_model(options: RunOptions) -> RunOptions:
+def _with_model(fit: FitOptions) -> FitOptions:
     """Return the options with the shipped network if none is named and one is installed."""
-    if options.model is not None:
-        return options
+    if fit.model is not None:
+        return fit
     try:
         find_model(SHIPPED)
     except UsageError:
-        return options
-    return replace(options, model=SHIPPED)
+        return fit
+    return replace(fit, model=SHIPPED)
 
 
 def compare(paths: Sequence[str], output: str, overwrite: bool, console: Console) -> None:
@@ -474,10 +416,7 @@ def _folder(output: str, names: Sequence[str], overwrite: bool, inputs: Sequence
     folder = Path(output)
     if output == STDOUT:
         raise UsageError("-o -: a report is a folder of files; expected a folder's name")
-    if folder.exists() and not folder.is_dir():
-        raise UsageError(f"-o {folder}: is a file; expected a folder's name")
-    if not folder.parent.is_dir():
-        raise UsageError(f"-o {folder}: the folder {folder.parent} does not exist; make it first")
+    check_folder(folder, "report")
     if not os.access(folder if folder.is_dir() else folder.parent, os.W_OK):
         raise UsageError(f"-o {folder}: is not writable; choose another folder")
     if folder.is_dir():

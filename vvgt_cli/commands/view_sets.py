@@ -1,14 +1,17 @@
-"""`render-views`: calibrated views of a volume for trainers, resumable and divisible into shards."""
+"""`render-views`: calibrated views of a volume for trainers, resumable and divisible into shards.
+
+A folder of views has images, and files that describe them: transforms.json, COLMAP, points, contact sheet.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
-from functools import partial
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,40 +19,190 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera, default_views, orbit_views
 from vvgt_cli.cameras.boxed import render_in_box, to_box_frame
-from vvgt_cli.cameras.files import read_frames
+from vvgt_cli.cameras.files import blender_json, colmap_model, point_cloud_ply, read_frames, transforms_json
 from vvgt_cli.cameras.sets import FIELD_OF_VIEW, RADIUS, SET_VIEWS, SIZE
-from vvgt_cli.commands.view_files import (
-    CONTACT,
-    POINTS,
-    Layout,
-    View,
-    field_points,
-    start_points,
-    thumbnail,
-    thumbnails,
-)
 from vvgt_cli.conversion.manifest import Manifest, Shard, parse_shard
-from vvgt_cli.device import on_device
+from vvgt_cli.conversion.opened import opened_upright, read_once
 from vvgt_cli.errors import DataError, NothingVisible, UsageError
 from vvgt_cli.field.blocked import Blocked
 from vvgt_cli.field.digests import cameras_digest, volume_digest
-from vvgt_cli.field.field import Picture
-from vvgt_cli.field.open import FieldNeeds, automatic, blocked, store_beside
+from vvgt_cli.field.field import Field, Picture, Resident
+from vvgt_cli.field.open import FieldNeeds, store_beside
 from vvgt_cli.field.settings import BlockOptions
-from vvgt_cli.field.source import SourceRequest, StyledVolume, describe_source, load_all
+from vvgt_cli.field.source import SourceRequest, StyledVolume
 from vvgt_cli.files import atomic_write, claim
 from vvgt_cli.gaussians.outputs import check_folder
-from vvgt_cli.images import write_png
-from vvgt_cli.jit.ahead import VIEWS, for_blocks
+from vvgt_cli.images import contact_sheet, over, write_exr, write_png
+from vvgt_cli.images.files import read_view
+from vvgt_cli.jit.ahead import VIEWS
 from vvgt_cli.library.inputs import PathLike
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.version import VERSION
-from vvgt_cli.volume.space import shear_text
 from vvgt_cli.volume.types import IDENTITY
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import RenderSettings
+    from vvgt_cli.field.field import Field
+
+
+CONTACT = "contact.png"
+POINTS_FILE = "points3d.ply"  # the original 3DGS code looks for this name
+POINTS = 20_000  # Gaussians of the closed form whose centres become the cloud
+COARSER = 4  # that many are wider than cells for the images' own size: these would cost four times the time
+THUMBNAIL = 160  # pixels along a thumbnail's edge, at most
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera and the set that it belongs to, ``train`` or ``test``."""
+
+    split: str
+    camera: Camera
+
+    @property
+    def stem(self) -> str:
+        """Return the relative path of its images without suffix."""
+        return f"{self.split}/{self.camera.name}"
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Files that a view is written to.
+
+    Attributes:
+        format: ``exr``, ``png`` or ``both``.
+        half: EXR in 16 bits.
+        background: RGB behind the opaque images for COLMAP and the contact sheet.
+        points: include an initial point cloud.
+    """
+
+    format: str = "both"
+    half: bool = False
+    background: Sequence[float] = (0.0, 0.0, 0.0)
+    points: bool = True
+
+    def __post_init__(self) -> None:
+        """Raise UsageError for 16 bits of no EXR."""
+        if self.half and self.format == "png":
+            raise UsageError("--half applies to EXR, which --format png does not write; give only one of the two")
+
+    @property
+    def suffix(self) -> str:
+        """Return the suffix of the images that `transforms.json` names."""
+        return ".exr" if self.format == "exr" else ".png"
+
+    @property
+    def exact(self) -> bool:
+        """Return whether a view's pixels are stored as they were rendered."""
+        return self.format != "png" and not self.half
+
+    def files(self, view: View) -> list[str]:
+        """Return the relative paths of a view's images."""
+        stem, names = view.stem, []
+        if self.format != "png":
+            names.append(f"{stem}.exr")
+        if self.format != "exr":
+            names.append(f"{stem}.png")
+            if view.split == "train":
+                names.append(f"images/{view.camera.name}.png")
+        return names
+
+    def folders(self, views: Sequence[View]) -> list[str]:
+        """Return the relative paths of the folders that hold the images and the COLMAP model."""
+        names = [name for view in views for name in self.files(view)]
+        return sorted({name.rpartition("/")[0] for name in names} | ({"sparse/0"} if self.format != "exr" else set()))
+
+    def write(self, folder: Path, view: View, image: np.ndarray) -> list[str]:
+        """Write a view's image (h, w, 4) float32 premultiplied over existing files, and return their relative paths."""
+        for name in (files := self.files(view)):
+            if name.endswith(".exr"):
+                write_exr(folder / name, image, half=self.half, camera=view.camera, overwrite=True)
+            elif name.startswith("images/"):
+                write_png(folder / name, over(image, self.background), overwrite=True)
+            else:
+                write_png(folder / name, image, overwrite=True)
+        return files
+
+    def descriptions(self, views: Sequence[View]) -> dict[str, bytes]:
+        """Return the `transforms` files by relative path; the splits share no view."""
+        train = [view for view in views if view.split == "train"]
+        test = [view for view in views if view.split == "test"]
+        names = {split: [view.stem + self.suffix for view in of] for split, of in (("train", train), ("test", test))}
+        splits = {"train": names["train"], "val": names["test"], "test": names["test"]} if test else None
+        paths = [view.stem + self.suffix for view in views]
+        cameras = [view.camera for view in views]
+        cloud = POINTS_FILE if self.points else None
+        files = {"transforms.json": transforms_json(cameras, ply_file_path=cloud, paths=paths, splits=splits)}
+        for split, of in (("train", train), ("test", test)):
+            if of:
+                files[f"transforms_{split}.json"] = blender_json([v.camera for v in of], [f"./{v.stem}" for v in of])
+        return {name: text.encode() for name, text in files.items()}
+
+    def models(self, views: Sequence[View], points: np.ndarray, colors: np.ndarray) -> dict[str, bytes]:
+        """Return the point cloud (n, 3), and with PNG the COLMAP model of the training views, by relative path."""
+        files = {POINTS_FILE: point_cloud_ply(points, colors)} if self.points else {}
+        if self.format != "exr":
+            train = [view.camera for view in views if view.split == "train"]
+            model = colmap_model(train, [f"{camera.name}.png" for camera in train], points, colors)
+            files |= {f"sparse/0/{name}": data for name, data in model.items()}
+        return files
+
+    def model_names(self) -> list[str]:
+        """Return the relative paths of the files of `models`."""
+        colmap = [f"sparse/0/{name}.bin" for name in ("cameras", "images", "points3D")]
+        return [*([POINTS_FILE] if self.points else []), *(colmap if self.format != "exr" else [])]
+
+
+def start_points(field: Field, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return centres (unit frame) and colours of the closed form's Gaussians, (n, 3) each; none if nothing is visible.
+
+    Views are ``size`` px high.
+    """
+    from vvgt_cli.closed_form import VbmOptions
+
+    gaussians = field.pyramid(VbmOptions(POINTS, max(size // COARSER, 1))).gaussians
+    half = np.array(field.source.volume.unit_frame().half)
+    points = np.clip(gaussians.means.astype(np.float64), -half, half)
+    return points @ field.source.volume.axes.T, np.clip(gaussians.colors, 0, 1)
+
+
+def thumbnail(image: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return a camera's ``image`` (h, w, 4) float32, averaged down to at most `THUMBNAIL` pixels a side."""
+    factor = _factor(camera)
+    h, w = image.shape[0] // factor, image.shape[1] // factor
+    small: np.ndarray = image[: h * factor, : w * factor].reshape(h, factor, w, factor, 4).mean(axis=(1, 3))
+    return small
+
+
+def thumbnails(
+    folder: Path, views: Sequence[View], background: Sequence[float], known: Mapping[str, np.ndarray]
+) -> np.ndarray:
+    """Return the contact sheet of the views on disk, (H, W, 3) float32 in [0, 1], training views first.
+
+    ``known``: some views' thumbnails, by stem.
+    """
+    height = max(_shrunk(view.camera.height, view.camera) for view in views)
+    width = max(_shrunk(view.camera.width, view.camera) for view in views)
+    tiles = []
+    for view in views:
+        small = known.get(view.stem)
+        if small is None:
+            small = thumbnail(read_view(folder / view.stem), view.camera)
+        h, w = small.shape[:2]
+        tile = np.zeros((height, width, 4), np.float32)
+        top, left = (height - h) // 2, (width - w) // 2
+        tile[top : top + h, left : left + w] = small
+        tiles.append(tile)
+    return contact_sheet(tiles, background=background)
+
+
+def _factor(camera: Camera) -> int:
+    return min(-(-max(camera.width, camera.height) // THUMBNAIL), camera.width, camera.height)
+
+
+def _shrunk(pixels: int, camera: Camera) -> int:
+    return pixels // _factor(camera)
 
 
 Draw = Callable[[Camera], np.ndarray]
@@ -138,29 +291,24 @@ class Rays:
 class _Set:
     """One function's folder and the views to render there."""
 
-    source: StyledVolume
-    blocks: Blocked | None  # where the volume is not in memory
+    field: Field
     manifest: Manifest
     layout: Layout
     views: list[View]
     pending: list[View]  # this part's
     files: list[str]  # of the descriptions and models that this part writes
-    small: dict[str, np.ndarray] = field(default_factory=dict)  # thumbnails of views that were rendered
+    small: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)  # thumbnails of views that were rendered
 
     @property
     def folder(self) -> Path:
         return self.manifest.folder
 
 
-Opened = list[tuple[StyledVolume, Blocked | None]]
-Points = Callable[[int], tuple[np.ndarray, np.ndarray]]
-
-
 def open_looks(
     run: Run, requests: Sequence[SourceRequest], blocks: BlockOptions | None, folders: Sequence[Path] | None,
-    size: int, renderer: str, stack: ExitStack,
-) -> Opened:  # fmt: skip
-    """Return a volume under each of several looks, with its field if it is read in blocks, which ``stack`` closes.
+    size: int, rays: Rays, stack: ExitStack,
+) -> list[Field]:  # fmt: skip
+    """Return a volume under each of several looks, which ``stack`` closes.
 
     Args:
         run: times the stages.
@@ -168,54 +316,32 @@ def open_looks(
         blocks: None: in blocks if the volume is large.
         folders: blocks are kept beside them, one a look; None: in a temporary folder, for one.
         size: px, height of a view.
-        renderer: "vtk" needs the volume in memory.
+        rays: renderer, of which "vtk" needs the volume in memory, and device.
         stack: closes what is opened.
 
     Raises:
         DataError: a volume or function that is not valid, or a sheared volume.
         UsageError: a renderer that needs the volume in memory.
     """
-    options, opened = blocks or automatic(requests[0], run.console), Opened()
-    if options is not None and renderer != "vvgt":
-        raise UsageError(f"--renderer {renderer}: needs the whole volume in memory; in blocks: vvgt")
-    if options is None:
-        with run.stage("read") as stage:
-            opened = [(source, None) for source in load_all(requests)]
-            stage.note = describe_source(opened[0][0])
-    else:
-        for request, folder in zip(requests, folders or [Path()], strict=True):
-            store = stack.enter_context(store_beside(str(folder) if folders else None))
-            part = stack.enter_context(blocked(run, request, options, store, FieldNeeds(POINTS, size)))
-            opened.append((part.source, part))
-    volume = opened[0][0].volume
-    if volume.sheared:
-        raise DataError(
-            f"{volume.name}: {shear_text(volume.axes)}; expected right angles: no pinhole camera sees a sheared "
-            "volume; resample it first ('vvgt convert' accepts it)"
-        )
-    sources = [source for source, _ in opened]
-    lit = [source for source in sources if source.lighting is not None]
-    lit.sort(key=lambda source: source.lighting is not None and source.lighting.sky is not None)
-    kernels = (lit or sources)[-1].kernels(VIEWS)
-    run.compile(for_blocks(kernels) if options else kernels, sources[0].kernel_type())
-    return opened
+    requests, blocks = read_once(run, requests, blocks)
+    if blocks is not None and rays.renderer != "vvgt":
+        raise UsageError(f"--renderer {rays.renderer}: needs the whole volume in memory; in blocks: vvgt")
+    fields = []
+    for request, folder in zip(requests, folders or [Path()], strict=True):
+        store, needs = store_beside(str(folder) if folders else None), FieldNeeds(POINTS, size)
+        fields.append(stack.enter_context(opened_upright(run, request, blocks, needs, VIEWS, store, rays.device)))
+    return fields
 
 
-def prepare(
-    run: Run, source: StyledVolume, blocks: Blocked | None, rays: Rays, cameras: Sequence[Camera]
-) -> tuple[Draw, Points]:
-    """Return what draws a view of ``cameras``, and what makes points to start from for a size in px."""
-    from vvgt_cli.dvr import RenderSettings, render_view
+def prepare(field: Field, rays: Rays, cameras: Sequence[Camera]) -> Draw:
+    """Return what draws a view of ``cameras``."""
+    from vvgt_cli.dvr import RenderSettings
     from vvgt_cli.dvr.backends import view_renderer
 
     settings = RenderSettings(rays.step, None if rays.samples == "adaptive" else int(rays.samples))
-    if blocks is not None:
-        return draw_in_blocks(blocks, settings, cameras), partial(field_points, blocks)
-    with run.stage("scene") as stage:
-        scene = on_device(source.scene(), rays.device, run.console.message)
-        stage.note = f"{source.name}, opacity per {source.unit_distance:g} ({source.unit_label})"
-    inside = view_renderer(rays.renderer, scene, settings) if cameras else partial(render_view, scene)
-    return render_in_box(inside, scene.volume.axes), partial(start_points, scene)
+    if rays.renderer != "vvgt" and isinstance(field, Resident) and cameras:
+        return render_in_box(view_renderer(rays.renderer, field.scene, settings), field.source.volume.axes)
+    return draw_views(field, settings, cameras)
 
 
 def render_looks(
@@ -242,8 +368,8 @@ def render_looks(
         )
     with ExitStack() as stack:
         asked, height = list(requests.values()), cameras[0].height
-        ((source, field),) = open_looks(run, asked, blocks, None, height, rays.renderer, stack)
-        draw, _ = prepare(run, source, field, rays, cameras)
+        (field,) = open_looks(run, asked, blocks, None, height, rays, stack)
+        draw = prepare(field, rays, cameras)
         return cameras, np.stack([draw(camera) for camera in cameras])
 
 
@@ -260,15 +386,15 @@ def write_views(
     folders, asked = folders_of(output, list(requests)), list(requests.values())
     rays, shard = rays or Rays(), shard or Shard()
     with ExitStack() as stack:
-        opened = open_looks(run, asked, blocks, folders, views[0].camera.height, rays.renderer, stack)
+        fields = open_looks(run, asked, blocks, folders, views[0].camera.height, rays, stack)
         with run.stage("plan") as stage:
-            sets = _plan(opened, folders, views, layout, rays, shard, overwrite)
+            sets = _plan(fields, folders, views, layout, rays, shard, overwrite)
             total = sum(len(one.pending) for one in sets)
             stage.note = f"{len(sets) * len(views)} views, {total} to render here"
         for one in sets:
             _work(run, one, rays)
-            if one.blocks is not None:
-                one.blocks.run_pass.store.remove()
+            if isinstance(one.field, Blocked):
+                one.field.run_pass.store.remove()
 
 
 def _settings(layout: Layout, rays: Rays, views: Sequence[View], source: StyledVolume, content: str) -> dict[str, Any]:
@@ -297,14 +423,14 @@ def _settings(layout: Layout, rays: Rays, views: Sequence[View], source: StyledV
 
 
 def _plan(
-    opened: Opened, folders: Sequence[Path], views: list[View], layout: Layout, rays: Rays, shard: Shard,
+    fields: list[Field], folders: Sequence[Path], views: list[View], layout: Layout, rays: Rays, shard: Shard,
     overwrite: bool,
 ) -> list[_Set]:  # fmt: skip
     """Find what is missing in every folder, before anything is written."""
-    content = volume_digest(opened[0][0].volume)
+    content = volume_digest(fields[0].source.volume)
     sets = []
-    for i, (folder, (source, blocks)) in enumerate(zip(folders, opened, strict=True)):
-        manifest = Manifest(folder, _settings(layout, rays, views, source, content), shard)
+    for i, (folder, field) in enumerate(zip(folders, fields, strict=True)):
+        manifest = Manifest(folder, _settings(layout, rays, views, field.source, content), shard)
         files = [*layout.descriptions(views), *layout.model_names()]
         planned = [name for view in views for name in layout.files(view)]
         manifest.open([*planned, *files, CONTACT], overwrite)
@@ -312,7 +438,7 @@ def _plan(
         pending = [view for view in mine if not all(map(manifest.complete, layout.files(view)))]
         # the first part describes the set
         missing = [name for name in files if shard.index == 1 and not manifest.complete(name)]
-        sets.append(_Set(source, blocks, manifest, layout, views, pending, missing))
+        sets.append(_Set(field, manifest, layout, views, pending, missing))
     return sets
 
 
@@ -321,13 +447,12 @@ def _work(run: Run, one: _Set, rays: Rays) -> None:
     manifest, layout, views = one.manifest, one.layout, one.views
     built = layout.descriptions(views)
     models = any(name not in built for name in one.files)
-    if one.pending or models:
-        draw, points = prepare(run, one.source, one.blocks, rays, [view.camera for view in one.pending])
+    draw = prepare(one.field, rays, [view.camera for view in one.pending])
     if models and layout.points:
         with run.stage("points") as stage:
-            cloud = points(views[0].camera.height)
+            cloud = start_points(one.field, views[0].camera.height)
             if not len(cloud[0]):
-                raise NothingVisible(one.source.volume.name, one.source.tf.name)
+                raise NothingVisible(one.field.source.volume.name, one.field.source.tf.name)
             stage.note = f"{len(cloud[0])} points to start from"
         built |= layout.models(views, *cloud)
     elif models:
@@ -394,21 +519,20 @@ def _write(manifest: Manifest, files: dict[str, bytes]) -> None:
     manifest.record(files)
 
 
-TOGETHER = 1 << 24  # pixels of views that are made at once
+TOGETHER = 1 << 24  # pixels of views that are made at once, at most, of a volume in blocks
 
 
-def draw_in_blocks(
-    field: Blocked, settings: RenderSettings, cameras: Sequence[Camera]
-) -> Callable[[Camera], np.ndarray]:
-    """Return a function that draws a volume in blocks; at most `TOGETHER` pixels of coming views at once."""
-    axes = field.source.volume.axes
-    left = list(cameras)
+def draw_views(field: Field, settings: RenderSettings, cameras: Sequence[Camera]) -> Draw:
+    """Return a function that draws views of ``cameras`` in their order; one in blocks several of them at once."""
+    axes, left, ahead = field.source.volume.axes, list(cameras), 0
 
     def inside(camera: Camera) -> np.ndarray:
-        if not field.pictures:
-            many = max(TOGETHER // (camera.width * camera.height), 1)
-            field.views.expect([Picture(to_box_frame(other, axes)[0], settings) for other in left[:many]])
-            del left[:many]
+        nonlocal ahead
+        if not ahead:
+            ahead = max(TOGETHER // (camera.width * camera.height), 1)
+            field.views.expect([Picture(to_box_frame(other, axes)[0], settings) for other in left[:ahead]])
+            del left[:ahead]
+        ahead -= 1
         image = field.views.view(camera, settings)
         field.views.forget(Picture(camera, settings))
         return image

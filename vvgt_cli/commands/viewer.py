@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vvgt_cli.commands.converter import Converter
-from vvgt_cli.commands.live_site import BYTES, HTML, JSON, SCRIPT, PageController, ServedCloud, plain_name, stored
+from vvgt_cli.commands.live_site import BYTES, HTML, JSON, SCRIPT, PageController, plain_name, stored
 from vvgt_cli.commands.server import Resource, Site, served
-from vvgt_cli.conversion.gaussian_files import STDIN, layout_of, open_gaussians, read_back, write_gaussians, write_page
-from vvgt_cli.conversion.index import named_files
+from vvgt_cli.conversion.clouds import Cloud, Clouds, write_together
+from vvgt_cli.conversion.gaussian_files import STDIN, layout_of, open_gaussians, read_back, write_gaussians
+from vvgt_cli.conversion.index import FRAMES, named_files
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians, PlyOptions
@@ -29,6 +30,7 @@ from vvgt_cli.gaussians.formats.sog import IMAGES, META
 from vvgt_cli.gaussians.formats.splats import columns_of
 from vvgt_cli.gaussians.formats.streamed import MANIFEST, corners, is_streamed, placed, read_manifest
 from vvgt_cli.gaussians.outputs import Output, claimed
+from vvgt_cli.gaussians.rules import INRIA
 from vvgt_cli.gaussians.story import Story
 from vvgt_cli.jit.ahead import DRAW, for_degree
 from vvgt_cli.score.record import Run
@@ -41,11 +43,11 @@ SOON = 10.0  # seconds of reading after which a page is shown that waits; earlie
 LINGER = 1.0  # seconds in which such a page hears why nothing comes
 
 
-Clouds = Sequence[tuple[str, str]]  # name and file of each
+Named = Sequence[tuple[str, str]]  # name and file of each
 
 
 def save(
-    run: Run, clouds: Clouds, source: SourceRequest, output: str, *, values: bool, title: str | None,
+    run: Run, clouds: Named, source: SourceRequest, output: str, *, values: bool, title: str | None,
     story: Story | None, overwrite: bool,
 ) -> None:  # fmt: skip
     """Write Gaussians, or a volume that is converted, as `vvgt_cli.view` does."""
@@ -69,7 +71,7 @@ def save(
 
 
 def show(
-    run: Run, clouds: Clouds, source: SourceRequest, title: str | None, port: int, browser: bool,
+    run: Run, clouds: Named, source: SourceRequest, title: str | None, port: int, browser: bool,
     announce: Callable[[str], None],
 ) -> None:  # fmt: skip
     """Show Gaussians or a volume until an interrupt; ``announce`` is called with the page's URL when it can be opened.
@@ -101,7 +103,7 @@ def _is_series(source: SourceRequest) -> bool:
 
 
 def _join(
-    run: Run, output: str, clouds: Clouds, source: SourceRequest, story: Story | None, overwrite: bool
+    run: Run, output: str, clouds: Named, source: SourceRequest, story: Story | None, overwrite: bool
 ) -> None:  # fmt: skip
     """Write several files into one page."""
     files = [file for _, file in clouds]
@@ -114,11 +116,17 @@ def _join(
         )
     with claimed([Output("-o", output, (".html",), splats=True)], files, overwrite):
         names = [name for name, _ in clouds]
-        if len(set(names)) < len(names):
-            names = list(files)
-        write_page(
-            run, output, list(zip(names, files, strict=True)), overwrite, story and story.checked((), len(files))
-        )
+        names = names if len(set(names)) == len(names) else files
+        shown, told, rules = list[Cloud](), story and story.checked((), len(files)), set[str]()
+        for name, file in zip(names, files, strict=True):
+            gaussians, header = open_gaussians(file)
+            layout = replace(layout_of(header), story=told)
+            shown.append(Cloud(gaussians, run.report, layout, name, name, {}, None))
+            rules.add(header.rule or INRIA.name)
+        if len(rules) > 1:
+            made = ", ".join(sorted(rules))
+            run.console.message(f"{output}: made for {made}; the page draws all by the rule of the first")
+        write_together(run, Clouds(FRAMES, output, shown), output, overwrite)
 
 
 def _refuse_reading(given: SourceRequest, name: str) -> None:
@@ -158,7 +166,7 @@ def _opened(run: Run, name: str, request: ConvertRequest) -> tuple[Gaussians, Pl
 
 
 def _serve(
-    run: Run, clouds: Clouds, source: SourceRequest, port: int, browser: bool, announce: Callable[[str], None]
+    run: Run, clouds: Named, source: SourceRequest, port: int, browser: bool, announce: Callable[[str], None]
 ) -> None:
     files = [file for _, file in clouds]
     if len(files) > 1:
@@ -176,7 +184,7 @@ def _serve(
             resources |= _series(clouds)
         elif given:
             gaussians, header = open_gaussians(files[0])
-            controller.show(ServedCloud(gaussians, layout_of(header), controller.name))
+            controller.show(gaussians, layout_of(header))
         url = stack.enter_context(served(site, port))
         if not resources.get(""):
             converter = stack.enter_context(Converter(source, controller.name, controller.on_message))
@@ -193,7 +201,7 @@ def _serve(
         raise controller.error
 
 
-def _series(clouds: Clouds) -> dict[str, Resource]:
+def _series(clouds: Named) -> dict[str, Resource]:
     """Return the page of several files, and each file, read when it is requested."""
 
     def content(k: int) -> bytes:

@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vvgt_cli.conversion.index import FRAMES, FUNCTIONS, LABELS
+from vvgt_cli.conversion.opened import read_once
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.defaults import INIT
 from vvgt_cli.errors import UsageError
-from vvgt_cli.field.layered import content_of, open_content
-from vvgt_cli.field.open import automatic
+from vvgt_cli.field.layered import content_of
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.look.labels import NO_LABELS
 from vvgt_cli.score.record import Run
@@ -165,19 +165,10 @@ class Functions(Batch):
 
     def prepare(self, run: Run) -> None:
         """Read the volume, where it fits in memory."""
-        source = self.request.source
-        blocks = self.request.blocks or automatic(source, run.console)
-        if blocks is not None:
-            self._requests = {name: replace(one, blocks=blocks) for name, one in self._requests.items()}
-            return
-        with run.stage("volume") as stage:
-            given = source.volume
-            content = open_content(source.path, source.read) if isinstance(given, str) else content_of(given)
-            content.prepare()
-            stage.note = f"{content.volumes[0].name}, for {len(self._requests)} functions"
-        self._requests = {
-            name: replace(one, source=replace(one.source, volume=content)) for name, one in self._requests.items()
-        }
+        requests = self._requests
+        sources, blocks = read_once(run, [one.source for one in requests.values()], self.request.blocks)
+        pairs = zip(requests.items(), sources, strict=True)
+        self._requests = {name: replace(one, source=source, blocks=blocks) for (name, one), source in pairs}
 
     def items(self, run: Run, wanted: Callable[[str], bool]) -> Iterator[Item]:
         """Yield an item for each function."""
@@ -190,13 +181,13 @@ class Functions(Batch):
 
 def options_in(request: ConvertRequest) -> set[str]:
     """Return the options of `CANNOT` that a request uses."""
-    fit, limits, source = request.fit, request.limits, request.source
+    fit, source = request.fit, request.source
     used = {
         "--checkpoint": request.checkpoint, "--report": request.report, "--preview": request.preview,
         "--live": request.live, "--tf": source.tf, "--layer": source.layers, "--steps": fit.steps,
         "--model": fit.model, "--labels none": source.labels == NO_LABELS,
-        "--max-megabytes": limits.max_megabytes, "--time-budget": limits.time_budget,
-        "--target-psnr": limits.target_psnr, "--device": fit.device != "cpu", "--for": fit.target,
+        "--max-megabytes": fit.max_megabytes, "--time-budget": fit.time_budget,
+        "--target-psnr": fit.target_psnr, "--device": fit.device != "cpu", "--for": fit.target,
         "--init": fit.init != INIT, "--frame world": request.ply.frame != "unit",
         "--story": request.story,
     }  # fmt: skip

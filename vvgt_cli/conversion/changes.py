@@ -11,7 +11,7 @@ from vvgt_cli.cameras import BLOCK, Camera
 from vvgt_cli.dvr.layers import Layer
 from vvgt_cli.field.source import StyledVolume
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.frames import rotations
+from vvgt_cli.gaussians.frames import axes_of
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.stored import read_block
@@ -38,8 +38,7 @@ class Changes:
 
     def meet(self, gaussians: Gaussians) -> np.ndarray:
         """Return (K,) bool, whether the bounding boxes of Gaussians (box frame) reach into a block that differs."""
-        factors = rotations(gaussians.quaternions) * np.exp(gaussians.log_scales.astype(np.float64))[:, None, :]
-        reach = REACH * np.sqrt((factors**2).sum(axis=2))
+        reach = REACH * np.sqrt((axes_of(gaussians) ** 2).sum(axis=2))
         most = np.array(self.blocks.shape[::-1])
         low = np.floor((gaussians.means - reach + self.half) / self.edge).astype(np.int64)
         high = np.floor((gaussians.means + reach + self.half) / self.edge).astype(np.int64) + 1
@@ -101,7 +100,7 @@ def _slabs(before: StyledVolume, after: StyledVolume, reach: int) -> Iterator[tu
             if new.volume.dims == dims:  # layers on other grids are the same file in all frames
                 changed |= _differ(old, new, after, low, high)
         for _ in range(reach):
-            changed = _around(changed, np.maximum)
+            changed = around(changed, np.maximum)
         yield z0, z1, changed[z0 - low : z1 - low]
 
 
@@ -127,7 +126,7 @@ def _differ(old: Layer, new: Layer, source: StyledVolume, low: int, high: int) -
     a, b = _data(old.volume, first), _data(new.volume, second)
     same: np.ndarray = (a == b) | (np.abs(a - b) <= SAME * (hi - lo)) | (np.isnan(a) & np.isnan(b))
     if not same.all():
-        least, most = _around(np.fmin(a, b), np.fmin), _around(np.fmax(a, b), np.fmax)
+        least, most = around(np.fmin(a, b), np.fmin), around(np.fmax(a, b), np.fmax)
         same |= ~_visible(new.tf, lo, hi, least, most)
     changed = ~same
     return changed
@@ -155,7 +154,7 @@ def _data(volume: Volume, stored: np.ndarray) -> np.ndarray:
     return result
 
 
-def _around(values: np.ndarray, take: np.ufunc) -> np.ndarray:
+def around(values: np.ndarray, take: np.ufunc) -> np.ndarray:
     """Apply ``take``, a maximum or minimum, to each voxel and its 26 neighbours."""
     for axis in range(3):
         out = values.copy()

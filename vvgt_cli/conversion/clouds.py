@@ -13,7 +13,6 @@ import numpy as np
 from vvgt_cli.conversion.index import (
     FRAMES,
     entry,
-    index_of,
     index_output,
     is_pattern,
     psnr_of,
@@ -26,15 +25,21 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians.formats import SUFFIXES, format_of, is_page
 from vvgt_cli.gaussians.formats.nodes import Node
+from vvgt_cli.gaussians.formats.page_look import contents, page_of_several
 from vvgt_cli.gaussians.formats.splats import splats_of
 from vvgt_cli.gaussians.outputs import Output, check_outputs
 from vvgt_cli.gaussians.story import Story, StoryLike, read_story
+from vvgt_cli.score.record import Run
 
 if TYPE_CHECKING:
     from vvgt_cli.gaussians.formats.page_values import Values
     from vvgt_cli.look.function import TransferFunction
 
 
+SORTED = (
+    "{}: programs that sort Gaussians node by node (three.js, Babylon.js: a .glb) show what a node encloses on top, "
+    "or not at all"
+)
 NOT_IN_NODES = ("parents", "visible", "function")  # facts that the tree says itself, and the path of a file
 
 
@@ -145,7 +150,7 @@ class Clouds(Mapping[str, Result]):
             row = entry(cloud.name, len(cloud.gaussians), size, psnr_of(cloud.report), **cloud.facts)
             rows.append({**row, "file": Path(os.path.relpath(file, folder)).as_posix()})
             total += size
-        write_index(index.path, index_of(self.kind, self.volume, rows, **self.facts), overwrite)
+        write_index(index.path, self.kind, self.volume, rows, self.facts, overwrite)
         return total
 
     def nodes(self, sh_degree: int | None = None, **how: Any) -> list[Node]:
@@ -192,8 +197,6 @@ class Clouds(Mapping[str, Result]):
 
     def _html(self, name: str, story: Story | None = None) -> bytes:
         """Return one page of all clouds."""
-        from vvgt_cli.gaussians.formats.page_look import page_of_several
-
         plys = [cloud.ply if story is None else replace(cloud.ply, story=story) for cloud in self.clouds]
         shown = [(cloud.shown_name(), cloud.gaussians, ply) for cloud, ply in zip(self.clouds, plys, strict=True)]
         return page_of_several(shown, name, [cloud.held for cloud in self.clouds])
@@ -206,3 +209,15 @@ class Clouds(Mapping[str, Result]):
             return iframe(self._html(self.kind), self.kind)
         except DataError:
             return None
+
+
+def write_together(run: Run, clouds: Clouds, output: str, overwrite: bool) -> None:
+    """Write one file of all clouds by a stage of a run, and report what it holds; errors are those of `Clouds.save`."""
+    with run.stage("write") as stage:
+        run.report.bytes = clouds.save(output, overwrite=overwrite)
+        run.report.gaussians = sum(len(cloud.gaussians) for cloud in clouds.clouds)
+        size = f"{run.report.gaussians} Gaussians, {run.report.bytes / 1e6:.1f} MB"
+        stage.note = f"{output}: {len(clouds)} clouds, {size}"
+    first, names = clouds.clouds[0], [cloud.shown_name() for cloud in clouds.clouds]
+    page = is_page(output)
+    run.console.message(contents(first.ply, output, names, first.held) if page else SORTED.format(output))

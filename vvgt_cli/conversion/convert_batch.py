@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +24,7 @@ from vvgt_cli.conversion.batch import (
     check_options,
     options_in,
 )
-from vvgt_cli.conversion.clouds import Cloud, Clouds
+from vvgt_cli.conversion.clouds import Cloud, Clouds, write_together
 from vvgt_cli.conversion.convert import convert
 from vvgt_cli.conversion.fitting import plan_of
 from vvgt_cli.conversion.frames import FrameSeries, is_glob_of_volumes
@@ -33,7 +33,6 @@ from vvgt_cli.conversion.index import (
     FUNCTIONS,
     LABELS,
     entry,
-    index_of,
     index_output,
     is_pattern,
     psnr_of,
@@ -49,7 +48,6 @@ from vvgt_cli.errors import DataError, SeveralSteps, UsageError
 from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.files import claim
 from vvgt_cli.gaussians.formats import format_of, is_page
-from vvgt_cli.gaussians.formats.page_look import contents
 from vvgt_cli.gaussians.formats.streamed import MANIFEST, folder_of, is_streamed
 from vvgt_cli.gaussians.outputs import Output, check_outputs, claimed
 from vvgt_cli.gaussians.targets import check_opened
@@ -63,22 +61,17 @@ if TYPE_CHECKING:
 
 WHOLE_RUN = Shard()
 PLACE = ("scale", "centre", "affine", "space", "length_unit", "up")  # facts of a file's place in the world
-SORTED = (
-    "{}: programs that sort Gaussians node by node (three.js, Babylon.js: a .glb) show what a node encloses on top, "
-    "or not at all"
-)
 UNKNOWN = "0"  # stem of labels that are not read yet: not that of the index
 
 
 class Files:
-    """The sink that writes a file for each item, and their index; a series keeps a manifest, by which it resumes."""
+    """A file for each item of a batch, and their index; a series keeps a manifest, by which it resumes."""
 
     def __init__(self, request: ConvertRequest, shard: Shard) -> None:
         """Take the output names of ``request``."""
         self._request, self._shard = request, shard
         self._manifest: Manifest | None = None
         self._rows: dict[str, dict[str, Any]] = {}
-        self._stack = ExitStack()
 
     @property
     def _index(self) -> Output:
@@ -88,26 +81,24 @@ class Files:
         """Return the path of a file relative to the index, by which index and manifest have it."""
         return Path(os.path.relpath(name, Path(self._index.path).parent)).as_posix()
 
-    def names(self, batch: Batch, stem: str) -> list[str]:
-        """Return an item's names of output, report and preview.
+    def names(self, batch: Batch, stem: str) -> dict[str, str]:
+        """Return an item's output, report and preview, as far as they are asked for, the output first.
 
         Raise UsageError unless patterns have a place for it.
         """
-        request, facts = self._request, batch.places(stem)
-        given = {"-o": request.output, "--report": request.report, "--preview": request.preview}
-        return [put_name(option, name, batch.kind, stem, facts) for option, name in given.items() if name is not None]
+        facts, request = batch.places(stem), self._request
+        given = {"output": request.output, "report": request.report, "preview": request.preview}
+        return {
+            key: put_name("-o" if key == "output" else f"--{key}", name, batch.kind, stem, facts)
+            for key, name in given.items()
+            if name is not None
+        }
 
-    def _named(self, request: ConvertRequest, names: Sequence[str]) -> ConvertRequest:
-        rest = list(names)
-        output = rest.pop(0)
-        report = rest.pop(0) if self._request.report is not None else None
-        return replace(
-            request, output=output, report=report, preview=rest.pop(0) if rest else None,
-            overwrite=request.overwrite or self._manifest is not None,
-        )  # fmt: skip
+    def _named(self, request: ConvertRequest, names: Mapping[str, Any]) -> ConvertRequest:
+        return replace(request, **names, overwrite=request.overwrite or self._manifest is not None)
 
-    def open(self, batch: Batch, run: Run) -> None:
-        """Check the outputs, before and after the batch is prepared, and claim the folder of a series.
+    def open(self, batch: Batch, run: Run, stack: ExitStack) -> None:
+        """Check the outputs, before and after the batch is prepared; ``stack`` holds the claim to a folder.
 
         Raises:
             UsageError: outputs that may not be written, or a folder of another series.
@@ -117,26 +108,27 @@ class Files:
         self.names(batch, UNKNOWN)
         folder = Path(self._index.path).parent
         if is_streamed(self._request.output):
-            self._stack.enter_context(folder_of(folder / MANIFEST))
+            stack.enter_context(folder_of(folder / MANIFEST))
         self._check(batch)
         batch.prepare(run)
         rows = self._check(batch)
         if not batch.resumes:
             return
         self._manifest = Manifest(folder, batch.settings(), self._shard, what="frames")
-        self._stack.enter_context(claim(folder / self._shard.manifest))
-        names = [self._key(name) for name in (*(n for row in rows for n in row), self._index.path)]
+        stack.enter_context(claim(folder / self._shard.manifest))
+        names = [self._key(name) for name in (*(n for row in rows for n in row.values()), self._index.path)]
         self._manifest.open(names, self._request.overwrite)
         self._manifest.record()
 
-    def _check(self, batch: Batch) -> list[list[str]]:
+    def _check(self, batch: Batch) -> list[dict[str, str]]:
         """Check the outputs as far as stems are known, and return them; files of a series may exist."""
         request, stems, inputs = self._request, batch.stems, self._request.inputs()
         batch.check_names()
         rows, levels = [self.names(batch, stem) for stem in stems or [UNKNOWN]], is_streamed(request.output)
-        if same := [name for name, count in Counter(name for row in rows for name in row).items() if count > 1]:
+        every = [name for row in rows for name in row.values()]
+        if same := [name for name, count in Counter(every).items() if count > 1]:
             raise UsageError(f"{same[0]} would hold several {batch.kind}; expected another place in its name, as {{}}")
-        names = [name for row in rows for name in row if not levels or self._key(name).startswith("..")]
+        names = [name for name in every if not levels or self._key(name).startswith("..")]
         folders = sorted({str(Path(name).parent) for name in names})
         if batch.resumes and len(folders) > (0 if levels else 1):
             stated, more = ", ".join(folders[:3]), f", {Path(self._index.path).parent}, and those in it" * levels
@@ -149,127 +141,100 @@ class Files:
         outputs = [output for row in checked for output in self._named(request, row).outputs()]
         with ExitStack() as made:
             for row in checked:
-                made.enter_context(folder_of(row[0]))
+                made.enter_context(folder_of(row["output"]))
             check_outputs([*outputs, self._index], inputs, request.overwrite or batch.resumes or not stems)
         check_outputs([self._index], inputs, request.overwrite or batch.resumes)
         return rows
-
-    def close(self) -> None:
-        """Release the folder."""
-        self._stack.close()
 
     def wants(self, batch: Batch, stem: str) -> bool:
         """Return whether an item belongs to this shard and is not complete yet."""
         if self._manifest is None:
             return True
-        own = map(self._key, self.names(batch, stem))
+        own = map(self._key, self.names(batch, stem).values())
         return self._shard.holds(batch.stems.index(stem)) and not all(map(self._manifest.complete, own))
 
-    def convert(self, batch: Batch, item: Item, console: Console) -> ConversionReport:
-        """Convert an item to its files, and return the report."""
-        request = self._named(item.request, self.names(batch, item.stem))
-        return convert(request, console, start=batch.previous, finished=item.gaussians).report
+    def request(self, batch: Batch, item: Item) -> ConvertRequest:
+        """Return the request of an item, to its files."""
+        return self._named(item.request, self.names(batch, item.stem))
 
     def take(self, batch: Batch, item: Item, report: ConversionReport, facts: Mapping[str, Any]) -> None:
         """Record a complete item."""
-        names = [self._key(name) for name in self.names(batch, item.stem)]
-        row = entry(item.name, report.gaussians, report.bytes, psnr_of(report), **item.facts, **facts)
+        names = [self._key(name) for name in self.names(batch, item.stem).values()]
+        row = entry(item.name, report.gaussians, report.bytes, psnr_of(report), **facts)
         row["file"] = names[0]
         self._rows[item.stem] = row
         if self._manifest is not None:
             self._manifest.record(names, {names[0]: {"row": row}})
 
-    def finish(self, batch: Batch, console: Console) -> dict[str, Any]:
-        """Write and return the index; for shards, of the items recorded so far, so that the last shard lists all."""
+    def finish(self, batch: Batch, console: Console) -> None:
+        """Write the index; for shards, of the items recorded so far, so that the last shard lists all."""
         path, manifest, known = self._index.path, self._manifest, -1
         rows = list(self._rows.values())
         while manifest is None or len(manifest.files) > known:
             if manifest is not None:
                 known = len(manifest.files)
-                files = (self._key(self.names(batch, stem)[0]) for stem in batch.stems)
+                files = (self._key(self.names(batch, stem)["output"]) for stem in batch.stems)
                 rows = [manifest.files[file]["row"] for file in files if file in manifest.files]
-            index = index_of(batch.kind, batch.volume, rows, **batch.facts)
-            write_index(path, index, self._request.overwrite or manifest is not None)
+            overwrite = self._request.overwrite or manifest is not None
+            write_index(path, batch.kind, batch.volume, rows, batch.facts, overwrite)
             if manifest is None:
                 break
             manifest.refresh()  # another shard may have recorded its last item meanwhile
         console.message(f"{path}: {len(rows)} {batch.kind}, {len(self._rows)} of them converted in this run")
-        return index
 
 
-class Memory:
-    """The sink that keeps Gaussians, scores and layouts; all Gaussians are in the unit frame of the first volume."""
-
-    def __init__(self) -> None:
-        """Start without clouds."""
-        self._clouds: list[Cloud] = []
-        self._made: Cloud | None = None
-        self._first: tuple[UnitFrame, PlyOptions] | None = None
-
-    def open(self, batch: Batch, run: Run) -> None:
-        """Prepare the batch.
-
-        Raises:
-            UsageError: two items of one name.
-        """
-        batch.check_names()
-        batch.prepare(run)
-        if batch.request.story is not None:
-            batch.request.story.checked((), len(batch.stems))
-
-    def wants(self, batch: Batch, stem: str) -> bool:
-        """Return True: every item is kept."""
-        return True
-
-    def convert(self, batch: Batch, item: Item, console: Console) -> ConversionReport:
-        """Convert an item, release its volume, and return the report."""
-        alone = replace(item.request, output=None, report=None, preview=None)
-        conversion = convert(alone, console, start=batch.previous, finished=item.gaussians)
-        normals, own = conversion.normals(), conversion.field.source.volume.unit_frame()
-        gaussians, ply, self._first = conversion.gaussians, conversion.ply, self._first or (own, conversion.ply)
-        if own != self._first[0]:  # another layer's
-            gaussians = to_frame_of(gaussians, own, self._first[0])
-            ply = replace(ply, **{name: getattr(self._first[1], name) for name in PLACE})
-        values = None
-        if batch.kind == FRAMES and item.request.values:
-            values = conversion.field.source.values(share=len(batch.stems))
-        self._made = Cloud(gaussians, conversion.report, ply, item.name, item.stem, dict(item.facts), normals, values)
-        return conversion.report
-
-    def take(self, batch: Batch, item: Item, report: ConversionReport, facts: Mapping[str, Any]) -> None:
-        """Keep an item."""
-        assert self._made is not None
-        self._clouds.append(replace(self._made, facts={**self._made.facts, **facts}))
-
-    def finish(self, batch: Batch, console: Console) -> Clouds:
-        """Return all items as clouds."""
-        return Clouds(batch.kind, batch.volume, self._clouds, batch.facts)
-
-    def close(self) -> None:
-        """Do nothing."""
+def _cloud(
+    batch: Batch, item: Item, conversion: Conversion, facts: dict[str, Any], first: tuple[UnitFrame, PlyOptions]
+) -> Cloud:
+    """Return a conversion without its volume, in the unit frame of the ``first`` volume, with its layout."""
+    normals, own = conversion.normals(), conversion.field.source.volume.unit_frame()
+    gaussians, ply, values = conversion.gaussians, conversion.ply, None
+    if own != first[0]:  # another layer's
+        gaussians = to_frame_of(gaussians, own, first[0])
+        ply = replace(ply, **{name: getattr(first[1], name) for name in PLACE})
+    if batch.kind == FRAMES and item.request.values:
+        values = conversion.field.source.values(share=len(batch.stems))
+    return Cloud(gaussians, conversion.report, ply, item.name, item.stem, facts, normals, values)
 
 
-def _run(batch: Batch, sink: Files | Memory, console: Console) -> Any:
-    """Convert the items of a batch that a sink wants, one after the other, and finish the sink.
+def _run(batch: Batch, files: Files | None, console: Console) -> Clouds:
+    """Convert the items of a batch one after the other, to the ``files`` that are missing, or all of them into memory.
+
+    Returns:
+        The clouds that are in memory.
 
     Raises:
+        UsageError: two items of one name; see also `Files.open`.
         KeyboardInterrupt: Ctrl-C ended an item early; it is not recorded, so that the same command converts it again.
     """
-    once, outer = Once(), console
-    console = replace(console, once=once)
-    run = Run(console, ConversionReport("convert"))
-    try:
-        sink.open(batch, run)
-        for item in batch.items(run, lambda stem: sink.wants(batch, stem)):
-            report = sink.convert(batch, item, console)
-            if report.interrupted:
+    once, clouds, first = Once(), list[Cloud](), None
+    run = Run(replace(console, once=once), ConversionReport("convert"))
+    with ExitStack() as stack:
+        if files is not None:
+            files.open(batch, run, stack)
+        else:
+            batch.check_names()
+            batch.prepare(run)
+            if batch.request.story is not None:
+                batch.request.story.checked((), len(batch.stems))
+        for item in batch.items(run, lambda stem: files is None or files.wants(batch, stem)):
+            alone = replace(item.request, output=None, report=None, preview=None)
+            request = alone if files is None else files.request(batch, item)
+            conversion = convert(request, run.console, start=batch.previous, finished=item.gaussians)
+            if conversion.report.interrupted:
                 raise KeyboardInterrupt
-            sink.take(batch, item, report, batch.previous.facts() if batch.previous else {})
+            facts = {**item.facts, **(batch.previous.facts() if batch.previous else {})}
+            if files is not None:
+                files.take(batch, item, conversion.report, facts)
+            else:
+                first = first or (conversion.field.source.volume.unit_frame(), conversion.ply)
+                clouds.append(_cloud(batch, item, conversion, facts, first))
+            del conversion  # and its volume
         for line in once.repeated():
-            outer.message(line)
-        return sink.finish(batch, console)
-    finally:
-        sink.close()
+            console.message(line)
+        if files is not None:
+            files.finish(batch, run.console)
+    return Clouds(batch.kind, batch.volume, clouds, batch.facts)
 
 
 def convert_all(
@@ -338,25 +303,17 @@ def convert_all(
     batch = FrameSeries(request, share) if kind == FRAMES else Labels(request) if kind == LABELS else Functions(looks)
     if together:
         return _save_one_file(batch, request, output, console)
-    result = _run(batch, Files(request, share) if output else Memory(), console)
-    return None if output else result
+    clouds = _run(batch, Files(request, share) if output else None, console)
+    return None if output else clouds
 
 
 def _save_one_file(batch: Batch, request: ConvertRequest, output: str, console: Console) -> Clouds:
     """Convert a batch to a page, or a file with a node an item; raise DataError if nothing is visible in any."""
     run = Run(console, ConversionReport("convert"))
     with claimed(request.outputs(), request.inputs(), request.overwrite):
-        clouds: Clouds = _run(batch, Memory(), console)
+        clouds = _run(batch, None, console)
         if not clouds:
             raise DataError(f"{output}: nothing is visible in any of its clouds; try another function")
-        with run.stage("write") as stage:
-            size, total = clouds.save(output, overwrite=request.overwrite), sum(len(c.gaussians) for c in clouds.clouds)
-            stage.note = f"{output}: {len(clouds)} clouds, {total} Gaussians, {size / 1e6:.1f} MB"
-        names = [cloud.shown_name() for cloud in clouds.clouds]
-        run.console.message(
-            contents(clouds.clouds[0].ply, output, names, clouds.clouds[0].held)
-            if is_page(output)
-            else SORTED.format(output)
-        )
+        write_together(run, clouds, output, request.overwrite)
         run.finish()
     return clouds

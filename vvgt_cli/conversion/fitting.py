@@ -38,7 +38,7 @@ def check_request(request: ConvertRequest) -> None:
     request.budget()
     if request.live:
         check_live(request)
-    if request.checkpoint is not None and request.limits.time_budget is not None:
+    if request.checkpoint is not None and request.fit.time_budget is not None:
         raise UsageError("--checkpoint needs runs that are repeatable, which --time-budget prevents; give one of them")
     if request.fit.model is not None:
         read_card(find_model(request.fit.model))
@@ -60,7 +60,7 @@ def work_of(run: Run, request: ConvertRequest, field: Field) -> Work:
     """Return the state of a conversion before its first stage, with a budget that the limits allow."""
     degree, ply = degree_of(request, field.source), ply_options(request, field.source)
     budget = min(request.budget(), request.budget(degree))
-    return Work(run, field, replace(request.fit, max_gaussians=budget), request.limits, degree, ply=ply)
+    return Work(run, field, replace(request.fit, max_gaussians=budget), degree, ply=ply)
 
 
 def fit(
@@ -95,7 +95,7 @@ def fit(
     elif start is None:
         field.views.expect(_pictures(plan.stages, work.fit))
     check_memory(plan, *(() if start is None else start.memory(plan, work.fit)))
-    work.checkpoint = checkpoint_of(request.checkpoint, field, work.fit, request.limits)
+    work.checkpoint = checkpoint_of(request.checkpoint, field, work.fit)
     if finished is not None:
         work.gaussians = as_stored(finished)
     elif kept := work.checkpoint.load(FITTED):
@@ -128,7 +128,7 @@ def _parts(work: Work, request: ConvertRequest) -> OutOfCore | None:
         return None
     levels = is_streamed(request.output)
     together = not levels and (request.scored or format_of(request.output or "") is not None)
-    return OutOfCore(most_steps(work.fit, request.limits), levels, together, not request.scored)
+    return OutOfCore(most_steps(work.fit), levels, together, not request.scored)
 
 
 def _pictures(stages: Sequence[Stage], fit: FitOptions) -> list[Picture]:
@@ -143,7 +143,7 @@ def _planned(work: Work, request: ConvertRequest) -> tuple[Planner, Plan]:
     # a guess: there are fewer than pixels in a view twice as large as a small one
     wide = fit.max_gaussians <= (2 * view_edge(fit.screen, small=True)) ** 2
     planner = Planner(
-        request.limits, fit, sh_degree=request.ply.sh_degree or work.degree,
+        fit, sh_degree=request.ply.sh_degree or work.degree,
         wide=wide, whole=request.scored_whole, writes=request.writes,
         axes=headset_axes(work.field.source.volume, work.ply.up), parts=_parts(work, request),
     )  # fmt: skip
@@ -184,7 +184,7 @@ def _improve(work: Work, plan: Plan) -> None:
     for n, stage in enumerate([*ahead, None]):
         if not (stage is None and improved) and work.target_reached():
             for name in (other.name for other in ahead[n:] if other.improves):
-                work.run.skip(name, f"the check views have {work.limits.target_psnr:g} dB without it")
+                work.run.skip(name, f"the check views have {work.fit.target_psnr:g} dB without it")
             if not improved:
                 _take_fewest(work)
             return

@@ -200,7 +200,6 @@ class FrameSeries(Batch):
             "values": request.values,
             **({"story": list(request.story.steps)} if request.story else {}),
             **asdict(request.fit),
-            **asdict(request.limits),
             "model": read_text(find_model(request.fit.model) / CARD) if request.fit.model else None,
             **{key: ply[key] for key in ("frame", "sh_degree", "comments")},
             "up": up_axis(request.up, request.ply.frame, grid.space),

@@ -8,9 +8,8 @@ import secrets
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, BinaryIO
 
@@ -23,21 +22,20 @@ from vvgt_cli.errors import DataError, VvgtError
 from vvgt_cli.files import atomic_write, check_disk_space, is_stream
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, in_unit_frame, read_ply, write_ply
 from vvgt_cli.gaussians.formats import encoded, format_of, is_page, read_splats
-from vvgt_cli.gaussians.formats.levels import StreamedLevels
-from vvgt_cli.gaussians.formats.page_look import contents, page_of_several
+from vvgt_cli.gaussians.formats.page_look import contents
 from vvgt_cli.gaussians.formats.page_values import Values
 from vvgt_cli.gaussians.formats.splats import gaussians_of
+from vvgt_cli.gaussians.formats.streamed import StreamedLevels
 from vvgt_cli.gaussians.frames import transform, up_matrix
 from vvgt_cli.gaussians.outputs import STDOUT
 from vvgt_cli.gaussians.ply import ply_header, ply_rows
 from vvgt_cli.gaussians.rules import INRIA, Rule, rule_of
-from vvgt_cli.gaussians.story import Story
 from vvgt_cli.score.record import Run
 from vvgt_cli.score.viewing import PREVIEW_VIEWS
 from vvgt_cli.score.views import score_test_views
 
 if TYPE_CHECKING:
-    from vvgt_cli.conversion.stored import FinishedParts
+    from vvgt_cli.conversion.cut import FinishedParts
     from vvgt_cli.field.field import Field
     from vvgt_cli.volume import Volume
 
@@ -167,41 +165,6 @@ def _sink(output: str, overwrite: bool) -> Iterator[IO[bytes]]:
         return
     with atomic_write(output, overwrite) as temporary, open(temporary, "wb") as sink:
         yield sink
-
-
-def write_page(
-    run: Run, output: str, clouds: Sequence[tuple[str, str]], overwrite: bool, story: Story | None = None
-) -> None:  # fmt: skip
-    """Write several files of Gaussians as one page.
-
-    Args:
-        run: gets the stage and the size.
-        output: the page.
-        clouds: (name in the page's list, file) of each cloud.
-        overwrite: replace an existing page.
-        story: of the page.
-
-    Raises:
-        DataError: a file does not hold Gaussians.
-    """
-    with run.stage("write") as stage:
-        shown: list[tuple[str, Gaussians, PlyOptions]] = []
-        rules = set[str]()
-        for name, file in clouds:
-            gaussians, header = open_gaussians(file)
-            rules.add(header.rule or INRIA.name)
-            shown.append((name, gaussians, replace(layout_of(header), story=story)))
-            run.report.gaussians += len(gaussians)
-        with atomic_write(output, overwrite) as temporary:
-            run.report.bytes = temporary.write_bytes(page_of_several(shown, output))
-        if len(rules) > 1:
-            run.console.message(
-                f"{output}: made for {', '.join(sorted(rules))}; the page draws all by the rule of the first"
-            )
-        run.console.message(contents(shown[0][2], output, [name for name, _ in clouds]))
-        stage.note = (
-            f"{output}: {len(clouds)} clouds, {run.report.gaussians} Gaussians, {run.report.bytes / 1e6:.1f} MB"
-        )
 
 
 def write_file(

@@ -14,8 +14,7 @@ from typing import Any
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import read_text
 from vvgt_cli.gaussians.formats import SUFFIXES, format_of, is_splats
-from vvgt_cli.gaussians.formats.levels import split_name
-from vvgt_cli.gaussians.formats.streamed import MANIFEST, is_streamed
+from vvgt_cli.gaussians.formats.streamed import MANIFEST, is_streamed, split_name
 from vvgt_cli.gaussians.outputs import Output, write_text
 from vvgt_cli.score.record import SCHEMA, ConversionReport, plain
 from vvgt_cli.volume.readers import volume_name
@@ -126,17 +125,12 @@ def psnr_of(report: ConversionReport) -> float | None:
     return None if report.scores is None else report.scores["psnr"]
 
 
-def index_of(kind: str, volume: str, files: Sequence[dict[str, Any]], **facts: Any) -> dict[str, Any]:
-    """Return the document of an index; the paths of ``files`` are relative to it."""
-    document: dict[str, Any] = plain(
-        {"format": FORMAT, "schema": SCHEMA, "kind": kind, "volume": volume, **facts, "files": list(files)}
-    )
-    return document
-
-
-def write_index(path: str, index: dict[str, Any], overwrite: bool) -> None:
-    """Write an index atomically."""
-    write_text(path, json.dumps(index, indent=1, allow_nan=False) + "\n", overwrite)
+def write_index(
+    path: str, kind: str, volume: str, files: Sequence[dict[str, Any]], facts: Mapping[str, Any], overwrite: bool
+) -> None:
+    """Write an index atomically; the paths of ``files`` are relative to it."""
+    index = {"format": FORMAT, "schema": SCHEMA, "kind": kind, "volume": volume, **facts, "files": list(files)}
+    write_text(path, json.dumps(plain(index), indent=1, allow_nan=False) + "\n", overwrite)
 
 
 def is_index(path: str | Path) -> bool:

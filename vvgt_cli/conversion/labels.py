@@ -10,15 +10,14 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from vvgt_cli.closed_form import VbmOptions
 from vvgt_cli.conversion.batch import UNSAFE, Batch, Item
+from vvgt_cli.conversion.changes import around
 from vvgt_cli.conversion.fitting import fit, work_of
 from vvgt_cli.conversion.index import LABELS
-from vvgt_cli.conversion.label_assignment import assign_labels, hidden_cells
 from vvgt_cli.conversion.opened import open_field
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import DataError, NothingVisible
@@ -26,40 +25,25 @@ from vvgt_cli.field.layered import IN_MEMORY, OpenedFile, content_of, is_plain, 
 from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians, concatenate
+from vvgt_cli.gaussians.frames import axes_of
 from vvgt_cli.look import AUTO, NO_LABELS, NONE, Label, LabelTable, LightOptions, check_labels
 from vvgt_cli.look.label_files import read_labels
+from vvgt_cli.look.tables import extinction
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.label_maps import extents_of
 from vvgt_cli.volume.space import metres
+from vvgt_cli.volume.stored import planes, values_at
+
+MapLabel = tuple[Volume, LabelTable, Label]  # a label, and its map and table
+Part = tuple[Item, MapLabel | None]  # a label and the request that would convert it alone; or a layer without labels
 
 
-@dataclass(frozen=True)
-class LabelItem:
-    """A label, or a layer without labels, and the request that would convert it alone."""
-
-    name: str
-    stem: str
-    request: ConvertRequest
-    facts: dict[str, Any]
-
-    def text(self) -> str:
-        """Return its name for a message."""
-        return f"layer {self.name}"
-
-
-@dataclass(frozen=True)
-class MapLabel(LabelItem):
-    """A label of a map."""
-
-    volume: Volume
-    table: LabelTable
-    label: Label
-
-    def text(self) -> str:
-        """Return number and name for a message."""
-        return f"label {self.label.number}, {self.label.name}"
+def text_of(part: Part) -> str:
+    """Return the name of a layer, or number and name of a label, for a message."""
+    item, label = part
+    return f"layer {item.name}" if label is None else f"label {label[2].number}, {label[2].name}"
 
 
 class Labels(Batch):
@@ -74,7 +58,7 @@ class Labels(Batch):
     def __init__(self, request: ConvertRequest) -> None:
         """Start without labels; `prepare` finds them."""
         super().__init__(request, "")
-        self._layers: list[tuple[ConvertRequest, list[LabelItem]]] = []
+        self._layers: list[tuple[ConvertRequest, list[Part]]] = []
 
     def prepare(self, run: Run) -> None:
         """Read the map and its table, and those of the layers.
@@ -99,23 +83,22 @@ class Labels(Batch):
                 self._layers.append((own, _parts(own, content, names[-1] if len(sources) > 1 else "", tables, used)))
                 self.volume = self.volume or content.volumes[0].name
             self.facts = {"table": " + ".join(tables)}
-            items = [part for _, parts in self._layers for part in parts]
-            self.stems = [part.stem for part in items]
-            stage.note = f"{self.volume}, {len(items)} labels of {self.facts['table']}"
+            self.stems = [item.stem for _, parts in self._layers for item, _ in parts]
+            stage.note = f"{self.volume}, {len(self.stems)} labels of {self.facts['table']}"
 
     def items(self, run: Run, wanted: Callable[[str], bool]) -> Iterator[Item]:
         """Yield an item with its Gaussians for each label, and for each layer without labels."""
-        names: list[str] = [part.name for _, parts in self._layers for part in parts]
+        names: list[str] = [item.name for _, parts in self._layers for item, _ in parts]
         used: list[str] = []
         for request, parts in self._layers:
             for part, gaussians in zip(parts, _gaussians(request, parts, run), strict=True):
                 if gaussians is None:
-                    run.console.progress(f"skipped: {part.text()} (nothing of it is visible)")
+                    run.console.progress(f"skipped: {text_of(part)} (nothing of it is visible)")
                     continue
-                run.console.progress(f"{part.text()}: {len(gaussians)} Gaussians")
-                name = part.name if names.count(part.name) == 1 else part.stem
-                used.append(unused(name, used))
-                yield Item(used[-1], part.stem, part.request, part.facts, gaussians)
+                run.console.progress(f"{text_of(part)}: {len(gaussians)} Gaussians")
+                item = part[0]
+                used.append(unused(item.name if names.count(item.name) == 1 else item.stem, used))
+                yield replace(item, name=used[-1], gaussians=gaussians)
 
 
 def unused(name: str, used: Sequence[str]) -> str:
@@ -141,7 +124,7 @@ def _content(source: SourceRequest, stored: bool) -> OpenedFile:
 
 def _parts(
     request: ConvertRequest, content: OpenedFile, layer: str, tables: list[str], used: set[tuple[float, float, float]]
-) -> list[LabelItem]:  # fmt: skip
+) -> list[Part]:  # fmt: skip
     """Return the labels of a map, or a ``layer`` as a whole if it is none; add to ``tables`` and ``used`` colours.
 
     Raises:
@@ -152,7 +135,7 @@ def _parts(
     if not content.overlapping and (not content.single_volume or is_plain(content, source.tf, labels, (), IN_MEMORY)):
         name = layer or content.volumes[0].name
         whole = replace(source, volume=content) if request.blocks is None else source
-        return [LabelItem(name, UNSAFE.sub("-", name), replace(request, source=whole), {})]
+        return [(Item(name, UNSAFE.sub("-", name), replace(request, source=whole)), None)]
     read = read_labels(labels) if isinstance(labels, str) and labels not in (AUTO, NO_LABELS) else labels
     maps = layers_of(content, None, read, distance=source.unit_distance)
     maps = told_apart(maps, used) if layer else maps
@@ -169,7 +152,7 @@ def _parts(
             if label.shown_opacity > 0 and extent is not None:
                 shown.append((volume, table, label, extent))
     numbers = [label.number for *_, label, _ in shown]
-    items: list[LabelItem] = []
+    parts: list[Part] = []
     divided = shares([extent.count for *_, extent in shown], request.fit.max_gaussians)
     for (volume, table, label, extent), share in zip(shown, divided, strict=True):
         alone = replace(_source(request, content, volume), labels=table.only(label.number))
@@ -179,8 +162,8 @@ def _parts(
         if layer:
             facts["parents"] = (layer, *label.parents)
         one = replace(request, source=alone, fit=replace(request.fit, max_gaussians=share))
-        items.append(MapLabel(label.name, stem, one, facts, volume, table, label))
-    return items
+        parts.append((Item(label.name, stem, one, facts), (volume, table, label)))
+    return parts
 
 
 def _source(request: ConvertRequest, content: OpenedFile, volume: Volume) -> SourceRequest:
@@ -194,14 +177,14 @@ def _source(request: ConvertRequest, content: OpenedFile, volume: Volume) -> Sou
     return replace(source, read=replace(source.read, component=number))
 
 
-def _gaussians(request: ConvertRequest, parts: Sequence[LabelItem], run: Run) -> list[Gaussians | None]:
+def _gaussians(request: ConvertRequest, parts: Sequence[Part], run: Run) -> list[Gaussians | None]:
     """Return the Gaussians of each label, visible and hidden ones, box frame; None where there are none."""
     console = run.console
-    labels = [part for part in parts if isinstance(part, MapLabel)]
-    overlapping = len({id(label.volume) for label in labels}) > 1  # a Gaussian would mix their colours
-    if len(labels) < 2 or overlapping or not any(label.label.opacity for label in labels):
-        return [_alone(part, console) for part in parts]
-    whole = replace(request, source=replace(labels[0].request.source, labels=labels[0].table))
+    labels = [label for _, label in parts if label is not None]
+    overlapping = len({id(volume) for volume, *_ in labels}) > 1  # a Gaussian would mix their colours
+    if len(labels) < 2 or overlapping or not any(label.opacity for *_, label in labels):
+        return [_alone(item.request, console) for item, _ in parts]
+    whole = replace(request, source=replace(parts[0][0].request.source, labels=labels[0][1]))
     plain = replace(whole, source=replace(whole.source, light=LightOptions((NONE,))))
     with open_field(run, plain) as field, run.stage("hidden"):
         form = field.pyramid(VbmOptions(request.fit.max_gaussians, request.fit.screen)).form
@@ -210,28 +193,28 @@ def _gaussians(request: ConvertRequest, parts: Sequence[LabelItem], run: Run) ->
 
         hides = hidden_cells(form.seen.largest > HIDDEN, form.seen.edge, form.half, form.step)
     hidden: list[list[Gaussians]] = []
-    for label in labels:
+    for part, (volume, _, label) in zip(parts, labels, strict=True):
         hidden.append([])
-        off = not label.label.opacity
-        if not off and not hides.meet_label(label.volume, label.label.number):
+        off = not label.opacity
+        if not off and not hides.meet_label(volume, label.number):
             continue
-        console.progress(f"{label.text()}: converting {'it alone: off' if off else 'what others hide of it'}")
-        alone = _alone(label, console)
+        console.progress(f"{text_of(part)}: converting {'it alone: off' if off else 'what others hide of it'}")
+        alone = _alone(part[0].request, console)
         if alone is not None:
             hidden[-1].append(alone if off else alone.take(hides.contain(alone)))
     console.message("all labels: converting what is visible")
     remaining = max(request.fit.max_gaussians - sum(len(one) for mine in hidden for one in mine), 1)
     seen = _fit(replace(whole, fit=replace(request.fit, max_gaussians=remaining)), console)
-    on = [k for k, label in enumerate(labels) if label.label.opacity]
-    owner = np.array(on)[assign_labels(seen, [(labels[k].volume, labels[k].table, labels[k].label) for k in on])]
+    on = [k for k, (*_, label) in enumerate(labels) if label.opacity]
+    owner = np.array(on)[assign_labels(seen, [labels[k] for k in on])]
     both = [concatenate([*mine, seen.take(owner == k)]) for k, mine in enumerate(hidden)]
     return [one if len(one) else None for one in both]
 
 
-def _alone(part: LabelItem, console: Console) -> Gaussians | None:
+def _alone(request: ConvertRequest, console: Console) -> Gaussians | None:
     """Convert a label or layer as if it were the only one; return None where nothing is visible."""
     try:
-        return _fit(part.request, console)
+        return _fit(request, console)
     except NothingVisible:
         return None
 
@@ -252,3 +235,132 @@ def shares(voxels: Sequence[int], budget: int) -> list[int]:
     weight = np.array(voxels, np.float64) ** (2 / 3)
     weight = np.maximum(weight / weight.sum(), 0.01)
     return [max(int(budget * share), 1) for share in weight / weight.sum()]
+
+
+DARKENED = 0.1  # difference of colours that counts as much as a label's colour taken for black
+OFFSETS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # standard deviations along each axis at which labels are sampled
+REACH = (1, 2, 4)  # voxels from a Gaussian in no label, within which labels are near
+
+
+@dataclass(frozen=True)
+class HiddenCells:
+    """Cells that no view sees, nor any of their neighbours.
+
+    Attributes:
+        cells: (nz, ny, nx) bool.
+        edge: (3,) edges (x, y, z) of a cell in voxels.
+        half, step: (3,) half extents and voxel edges of the scene, unit frame.
+    """
+
+    cells: np.ndarray
+    edge: np.ndarray
+    half: np.ndarray
+    step: np.ndarray
+
+    def contain(self, gaussians: Gaussians) -> np.ndarray:
+        """Return (K,) bool, whether the centre of each Gaussian is hidden."""
+        voxels = (gaussians.means.astype(np.float64) + self.half) / self.step
+        i, j, k = (self._along(axis, voxels[:, axis]) for axis in range(3))
+        hidden: np.ndarray = self.cells[k, j, i]
+        return hidden
+
+    def meet_label(self, volume: Volume, number: int) -> bool:
+        """Return whether part of a label's surface, where it meets other labels or the box, is hidden."""
+        middles = [np.arange(n) + 0.5 for n in volume.dims]
+        x, y, z = (self._along(axis, middles[axis]) for axis in range(3))
+        none = np.zeros(volume.data.shape[1:], bool)
+        stored = (volume.slope * plane.astype(np.float64) + volume.intercept == number for plane in planes(volume))
+        before, here = none, next(stored)
+        for k in range(len(volume.data)):
+            after = next(stored, none)
+            inside = here & before & after
+            inside[1:] &= here[:-1]
+            inside[:-1] &= here[1:]
+            inside[:, 1:] &= here[:, :-1]
+            inside[:, :-1] &= here[:, 1:]
+            inside[[0, -1]] = inside[:, [0, -1]] = False
+            if (here & ~inside & self.cells[z[k]][y][:, x]).any():
+                return True
+            before, here = here, after
+        return False
+
+    def _along(self, axis: int, voxels: np.ndarray) -> np.ndarray:
+        """Return (n,) int64, the cell along an axis of positions in voxels from the box's corner."""
+        n = self.cells.shape[2 - axis]
+        cells: np.ndarray = np.clip(np.floor(voxels / self.edge[axis]), 0, n - 1).astype(np.int64)
+        return cells
+
+
+def hidden_cells(near: np.ndarray, edge: np.ndarray, half: np.ndarray, step: np.ndarray) -> HiddenCells:
+    """Return the cells that no training view sees.
+
+    Args:
+        near: (nz, ny, nx) bool, the cells that some view sees.
+        edge: see `HiddenCells`.
+        half: see `HiddenCells`.
+        step: see `HiddenCells`.
+    """
+    return HiddenCells(~around(near, np.maximum), edge, half, step)
+
+
+def assign_labels(gaussians: Gaussians, shown: Sequence[tuple[Volume, LabelTable, Label]]) -> np.ndarray:
+    """Return (K,) int64, the index of the label with most of each Gaussian's extinction, else a near one, by colour.
+
+    Args:
+        gaussians: box frame.
+        shown: labels with their maps and tables; all maps are on one grid.
+    """
+    frame = shown[0][0].unit_frame()
+    votes = np.zeros((len(gaussians), len(shown)), np.float32)
+    tau = extinction(np.array([label.opacity for *_, label in shown]), 1.0)
+    axes = axes_of(gaussians)
+    for axis in range(3):
+        for offset in OFFSETS:
+            points = gaussians.means + offset * axes[:, :, axis]
+            index = np.floor((points + frame.half) / frame.step).astype(np.int64)
+            _vote(index, np.exp(-0.5 * offset**2) * tau, shown, votes)
+    labels: np.ndarray = votes.argmax(axis=1)
+    lost = np.flatnonzero(votes.max(axis=1) == 0)
+    near = _near(np.floor((gaussians.means[lost] + frame.half) / frame.step).astype(np.int64), tau, shown)
+    colors = np.array([label.color for *_, label in shown])
+    for k, candidates in zip(lost, near, strict=True):
+        own = gaussians.colors[k]
+        share = np.clip(colors @ own / np.maximum((colors**2).sum(axis=1), 1e-6), 0, 1)  # light darkens
+        distance = np.abs(share[:, None] * colors - own).sum(axis=1) + DARKENED * (1 - share)
+        labels[k] = np.where(candidates, distance, np.inf).argmin()
+    return labels
+
+
+def _near(index: np.ndarray, weights: np.ndarray, shown: Sequence[tuple[Volume, LabelTable, Label]]) -> np.ndarray:
+    """Return (K, labels) bool, the labels near voxels ``index`` (K, 3) (x, y, z); all where none is within `REACH`."""
+    nearby = np.zeros((len(index), len(shown)), np.float32)
+    for reach in REACH:
+        rows = np.flatnonzero(nearby.max(axis=1) == 0)
+        votes = np.zeros((len(rows), len(shown)), np.float32)
+        shifts = np.array(list(itertools.product((-reach, 0, reach), repeat=3)))
+        around = (index[rows][:, None] + shifts).reshape(-1, 3)  # in one pass over a map that stays in its file
+        _vote(around, weights, shown, votes, np.repeat(np.arange(len(rows)), len(shifts)))
+        nearby[rows] = votes
+    near: np.ndarray = (nearby > 0) | (nearby.max(axis=1, keepdims=True) == 0)
+    return near
+
+
+def _vote(
+    index: np.ndarray, weights: np.ndarray, shown: Sequence[tuple[Volume, LabelTable, Label]], votes: np.ndarray,
+    owner: np.ndarray | None = None,
+) -> None:  # fmt: skip
+    """Add the ``weights`` (labels,) of the labels of voxels ``index`` (K, 3) (x, y, z) to ``votes`` (K, labels).
+
+    With ``owner`` (K,), each counts in that row instead, once for several voxels of a label.
+    """
+    maps = {id(volume): volume for volume, *_ in shown}
+    dims = np.array(shown[0][0].dims)
+    rows = np.flatnonzero(((index >= 0) & (index < dims)).all(axis=1))
+    for key, volume in maps.items():
+        values = values_at(volume, index[rows])
+        own = [(label.number, k) for k, (other, _, label) in enumerate(shown) if id(other) == key]
+        numbers, columns = (np.array(part) for part in zip(*sorted(own), strict=True))
+        at = np.minimum(np.searchsorted(numbers, values), len(numbers) - 1)
+        there = numbers[at] == values
+        row = rows[there] if owner is None else owner[rows[there]]
+        votes[row, columns[at[there]]] += weights[columns[at[there]]].astype(np.float32)

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from vvgt_cli.conversion.cut import Levels, StoredGaussians
 from vvgt_cli.conversion.level_selection import CutErrors
-from vvgt_cli.conversion.stored import Levels, StoredGaussians
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.digests import digest
 from vvgt_cli.files import atomic_write

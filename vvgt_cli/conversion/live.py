@@ -16,7 +16,7 @@ from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.closed_form import Start
 from vvgt_cli.closed_form.columns import MASS
 from vvgt_cli.conversion.place import to_box_frame, to_frame_of, to_unit_frame
-from vvgt_cli.conversion.recolored import Look, SeveralLooks, lookup_table, visible_cloud
+from vvgt_cli.conversion.recolored import lit, looks_of, lookup_table, visible_cloud
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.conversion.stages import ClosedFormStage, TestViews
@@ -54,12 +54,11 @@ GOLDEN = 0.6180339887498949  # labels of neighbouring numbers get codes far from
 
 def check_live(request: ConvertRequest) -> None:
     """Raise NoLiveForm, which names them, for options of a request that live files do not take."""
-    fit, limits, light = request.fit, request.limits, request.source.light
+    fit, light = request.fit, request.source.light
     given = {
-        "--target-psnr": limits.target_psnr is not None,
-        "--time-budget": limits.time_budget is not None,
-        "--max-megabytes (or write a page, -o OUT.html)": limits.max_megabytes is not None
-        and not is_page(request.output),
+        "--target-psnr": fit.target_psnr is not None,
+        "--time-budget": fit.time_budget is not None,
+        "--max-megabytes (or write a page, -o OUT.html)": fit.max_megabytes is not None and not is_page(request.output),
         "--steps": fit.steps is not None,
         "--model": fit.model is not None,
         "--init": fit.init != "moments",
@@ -102,7 +101,8 @@ class LiveForm(Stage):
             facts = LiveFacts.of(source.volume, source.overall, source.tf)
             gaussians = _one_layer(work.run, fit, work.field)
         table, lighting = _baked_look(source, facts), box_lighting(source)
-        work.gaussians = apply_light(baked(gaussians, table, pixel_width(fit.screen)), lighting)
+        assert gaussians.live is not None
+        work.gaussians = lit(baked(gaussians, table, pixel_width(fit.screen)), gaussians.live[:, AXIS], lighting)
         work.ply = replace(work.ply, live=facts)
 
 
@@ -142,10 +142,7 @@ class LiveLook(Stage):
 
 def _baked_look(source: StyledVolume, facts: LiveFacts) -> Looks:
     """Return the lookup table of a source's functions, for live Gaussians with these facts."""
-    look: Look = source.tf
-    if len(source.layers) > 1:
-        look = SeveralLooks(tuple((layer.tf, layer.unit_distance) for layer in source.layers))
-    return lookup_table(facts, look, source.unit_distance, source.volume.unit_frame().scale)
+    return lookup_table(facts, looks_of(source), source.unit_distance, source.volume.unit_frame().scale)
 
 
 def _one_layer(run: Run, fit: FitOptions, field: Field) -> Gaussians:
@@ -208,14 +205,6 @@ def box_lighting(source: StyledVolume) -> Lighting | None:
     inward = np.linalg.inv(source.volume.axes)
     turned = [triple((inward @ np.array(direction)).tolist()) for direction in source.lighting.directions]
     return replace(source.lighting, directions=tuple(turned))
-
-
-def apply_light(gaussians: Gaussians, lighting: Lighting | None) -> Gaussians:
-    """Return live Gaussians with their colours under a light in their frame."""
-    from vvgt_cli.closed_form.relight import relight
-
-    assert gaussians.live is not None
-    return gaussians if lighting is None else relight(gaussians, gaussians.live[:, AXIS], lighting)
 
 
 def function_table(source: StyledVolume) -> Table:

@@ -13,8 +13,9 @@ from typing import Any
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.digests import digest
-from vvgt_cli.files import atomic_write, read_text
+from vvgt_cli.files import read_text
 from vvgt_cli.gaussians.formats.streamed import level_files, remove_files
+from vvgt_cli.gaussians.outputs import write_text
 
 SCHEMA = 1
 COMMANDS = {"views": "vvgt render-views", "frames": "vvgt convert"}  # by content of the folder
@@ -149,8 +150,7 @@ class Manifest:
             "format": f"vvgt-{self.what}", "schema": SCHEMA, "hash": self.hash, "settings": self.settings,
             "files": self.recorded,
         }  # fmt: skip
-        with atomic_write(self.folder / self.shard.manifest, overwrite=True) as temporary:
-            temporary.write_text(json.dumps(document, indent=1) + "\n", "utf-8")
+        write_text(self.folder / self.shard.manifest, json.dumps(document, indent=1) + "\n", overwrite=True)
 
 
 def read_manifest(path: Path, what: str = "views") -> dict[str, Any]:

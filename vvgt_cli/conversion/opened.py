@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
 
 from vvgt_cli.conversion.place import placement_warnings, up_axis, with_place
 from vvgt_cli.conversion.request import ConvertRequest
+from vvgt_cli.errors import DataError
 from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.blocked import Blocked
 from vvgt_cli.field.field import Field
-from vvgt_cli.field.layered import content_of
-from vvgt_cli.field.open import MIN_BLOCKED, FieldNeeds, opened, store_beside
-from vvgt_cli.field.source import StyledVolume, tf_record, volume_record
+from vvgt_cli.field.layered import content_of, open_content
+from vvgt_cli.field.open import MIN_BLOCKED, FieldNeeds, automatic, opened, store_beside
+from vvgt_cli.field.settings import BlockOptions
+from vvgt_cli.field.source import SourceRequest, StyledVolume, tf_record, volume_record
 from vvgt_cli.gaussians import PlyOptions
 from vvgt_cli.gaussians.formats.streamed import is_streamed
 from vvgt_cli.gaussians.header import legend_text
@@ -24,6 +26,7 @@ from vvgt_cli.look.resolve import unit_of_values
 from vvgt_cli.look.suggest import fitting
 from vvgt_cli.refine import load_ahead
 from vvgt_cli.score.record import Run
+from vvgt_cli.volume.space import shear_text
 
 
 @contextmanager
@@ -60,6 +63,50 @@ def open_field(
             field.run_pass.store.remove()
 
 
+@contextmanager
+def opened_upright(
+    run: Run, request: SourceRequest, blocks: BlockOptions | None, needs: FieldNeeds, kernels: tuple[str, ...],
+    store: AbstractContextManager[BlockStore] | None = None, device: str = "cpu",
+    look: Callable[[StyledVolume], StyledVolume] = lambda source: source,
+) -> Iterator[Field]:  # fmt: skip
+    """Open a volume that pinhole cameras see; arguments and errors are those of `opened`.
+
+    Raises:
+        DataError: the volume is sheared.
+    """
+
+    def needed(source: StyledVolume, in_blocks: bool) -> tuple[str, ...]:
+        if source.volume.sheared:
+            text = shear_text(source.volume.axes)
+            raise DataError(
+                f"{source.volume.name}: {text}; expected right angles: no pinhole camera sees a sheared volume; "
+                "resample it first ('vvgt convert' accepts it)"
+            )
+        return source.kernels(kernels)
+
+    with opened(run, request, blocks, needs, needed, store, device, look) as field:
+        yield field
+
+
+def read_once(
+    run: Run, sources: Sequence[SourceRequest], blocks: BlockOptions | None
+) -> tuple[list[SourceRequest], BlockOptions | None]:
+    """Return the requests for one volume under several looks with its content, unless it is processed in blocks.
+
+    Errors are those of `vvgt_cli.field.layered.open_content`.
+    """
+    first = sources[0]
+    blocks = blocks or automatic(first, run.console)
+    if blocks is not None or len(sources) == 1:
+        return list(sources), blocks
+    with run.stage("volume") as stage:
+        given = first.volume
+        content = open_content(first.path, first.read) if isinstance(given, str) else content_of(given)
+        content.prepare()
+        stage.note = f"{content.volumes[0].name}, for {len(sources)} functions"
+    return [replace(source, volume=content) for source in sources], None
+
+
 def _report_source(run: Run, request: ConvertRequest, source: StyledVolume) -> None:
     """Report what was read."""
     ply = ply_options(request, source)
@@ -72,7 +119,7 @@ def _report_source(run: Run, request: ConvertRequest, source: StyledVolume) -> N
     run.report.volume = volume_record(source)
     run.report.transfer_function = tf_record(source, request.source)
     fit = request.fit
-    run.report.options = asdict(fit) | asdict(request.limits) | {
+    run.report.options = asdict(fit) | {
         "max_megabytes": request.megabytes, "frame": ply.frame, "up": ply.up, "sh_degree": ply.sh_degree,
     }  # fmt: skip
 

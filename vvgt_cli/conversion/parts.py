@@ -15,16 +15,15 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from vvgt_cli.cameras.sets import RADIUS, pixel_width
-from vvgt_cli.conversion.cut import Cut, Parts, TileGaussians
+from vvgt_cli.conversion.cut import Cut, FinishedParts, Levels, Parts, StoredGaussians, TileGaussians, save
 from vvgt_cli.conversion.level_selection import CUTS, STEP, CutErrors, errors_of
 from vvgt_cli.conversion.levels import NEAREST
-from vvgt_cli.conversion.request import FitOptions, Limits
+from vvgt_cli.conversion.request import FitOptions
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages.cells import Network
 from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT, TOO_FAINT, halve_budget_while_faint
 from vvgt_cli.conversion.stages.refinement import Refinement
 from vvgt_cli.conversion.stages.views import CheckViews, TrainingViews, view_count
-from vvgt_cli.conversion.stored import FinishedParts, Levels, StoredGaussians, save
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.dvr.render import BoxFrame
 from vvgt_cli.field.digests import digest
@@ -45,8 +44,7 @@ class Refiner:
 
     Attributes:
         reader, light: see `vvgt_cli.field.cells.CellBlocks`.
-        fit: options of the descent.
-        limits: target PSNR on a part's own weighted check views, at which its descent ends.
+        fit: options of the descent, which ends at the target PSNR on a part's own weighted check views.
         early: steps after which a part's descent may end (`early_end`).
         distances: distance from which each level is seen, unit frame.
     """
@@ -54,7 +52,6 @@ class Refiner:
     reader: Scalars | Layers
     light: Light | None
     fit: FitOptions
-    limits: Limits
     early: int | None = None
     distances: tuple[float, ...] = (RADIUS,)
 
@@ -132,7 +129,7 @@ def make_parts(
         DataError: a block is damaged.
     """
     parts = cut.parts(float(thresholds[0, 0]))
-    steps: Any = None if refiner is None else (refiner.fit, refiner.limits, refiner.distances)
+    steps: Any = None if refiner is None else (refiner.fit, refiner.distances)
     key = digest(cut.key, thresholds, steps, parts, least)[:16]
     kind = f"{'closed' if refiner is None else 'refined'}-{key}"
     task = PartTask(cut, parts, thresholds, least, kind, refiner)
@@ -246,7 +243,7 @@ def refine_part(part: VolumePart, gaussians: Gaussians, refiner: Refiner, distan
     fit = replace(refiner.fit, screen=max(round(pixel_width(1) / screen), edge))
     field = cast("Field", part)  # only its pictures are drawn
     run = Run(Console(quiet=True), ConversionReport("convert"))
-    work = Work(run, field, fit, refiner.limits, gaussians=start, weigh=lambda at: part.weights(at, FACES * width))
+    work = Work(run, field, fit, gaussians=start, weigh=lambda at: part.weights(at, FACES * width))
     CheckViews(edge=edge).run(work)
     if work.target_reached():
         return gaussians

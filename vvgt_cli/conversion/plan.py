@@ -5,9 +5,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import Any, ClassVar
 
-from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits, file_bytes
+from vvgt_cli.conversion.request import ConvertRequest, FitOptions, file_bytes
 from vvgt_cli.conversion.stage import Stage, Work
 from vvgt_cli.conversion.stages import (
     BackProjection,
@@ -131,7 +131,7 @@ class Planner:
     """The choice of stages for a request.
 
     Attributes:
-        limits, fit: the user's limits and options; ``fit.max_gaussians`` is within the limits.
+        fit: the user's options and limits; ``max_gaussians`` is within the latter.
         sh_degree: degree of the spherical harmonics in the file.
         wide: whether Gaussians are wide enough to be seen in small views.
         whole: whether all ten test views are scored.
@@ -140,7 +140,6 @@ class Planner:
         parts: the stage that makes all Gaussians out of core; None: they are made in memory.
     """
 
-    limits: Limits
     fit: FitOptions
     sh_degree: int = 0
     wide: bool = True
@@ -160,8 +159,8 @@ class Planner:
             plan.stages = [self.parts, *([] if levels else self._finish()), *last]
             return plan
         left = None
-        if self.limits.time_budget is not None:
-            left = self.limits.time_budget - spent - plan.seconds_of([*([] if begun else first), *last])
+        if self.fit.time_budget is not None:
+            left = self.fit.time_budget - spent - plan.seconds_of([*([] if begun else first), *last])
         between = self._improvements(plan, left)
         cut = any(isinstance(stage, CellsByError) for stage in between)
         if self._recuts() or any(isinstance(stage, BackProjection) for stage in between):
@@ -177,7 +176,7 @@ class Planner:
         network, left = self._network(plan, left)
         few = self.fit.steps is not None and self.fit.steps < ENOUGH_STEPS and left is None
         small = self.wide and not few and not network and self.fit.screen >= 2 * SMALLEST
-        wanted = most_steps(self.fit, self.limits)
+        wanted = most_steps(self.fit)
         steps = steps_in_time(wanted, left, lambda steps: self._seconds(workload, steps, small))
         if not steps:
             plan.skipped.append(("refinement", _time_left(left) if wanted else "no steps are requested"))
@@ -192,12 +191,12 @@ class Planner:
     def _finish(self) -> list[Stage]:
         """Return the few steps on whole views that follow those on parts; none where time is limited."""
         steps = min(FINISHING, self.fit.steps or FINISHING)
-        return self._descent(steps, self.wide, steps) if self.limits.time_budget is None else []
+        return self._descent(steps, self.wide, steps) if self.fit.time_budget is None else []
 
     def _descent(self, steps: int, small: bool, most: int) -> list[Stage]:
         """Return gradient descent with its views, and cells by error unless steps are few or a network runs."""
         enough = steps >= ENOUGH_STEPS and self.fit.init == "moments"  # else no pyramid can be cut again
-        early = early_end(self.fit, self.limits)
+        early = early_end(self.fit)
         early = None if early is None or early >= steps else early
         return [
             CheckViews(),
@@ -208,7 +207,7 @@ class Planner:
 
     def _recuts(self) -> bool:
         """Return whether the pyramid may be cut again, for fewer Gaussians."""
-        return self.limits.target_psnr is not None
+        return self.fit.target_psnr is not None
 
     def _seconds(self, workload: Workload, steps: int, small: bool) -> float:
         """Return the expected seconds of descent with its views (``small`` or not) and the check views."""
@@ -221,11 +220,11 @@ class Planner:
         projected = left is None or left >= whole
         if not projected:
             plan.skipped.append(("back-projection", f"about {whole:.1f} s with its views, {_time_left(left)}"))
-        check = CheckViews(fine=bool(network) or self.limits.target_psnr is not None)
+        check = CheckViews(fine=bool(network) or self.fit.target_psnr is not None)
         train = TrainingViews(view_count(0, small=False), view_edge(self.fit.screen, small=False), fitted=bool(network))
         if projected or network:
             return [check, train, *([BackProjection()] if projected else []), *network]
-        measured = self.limits.target_psnr is not None and (left is None or left >= views)
+        measured = self.fit.target_psnr is not None and (left is None or left >= views)
         return [check] if measured else []
 
     def _network(self, plan: Plan, left: float | None) -> tuple[list[Stage], float | None]:
@@ -291,14 +290,31 @@ def report_target(run: Run, fit: FitOptions, megabytes: float | None) -> None:
 
 
 class WarmStart(ABC):
-    """Gaussians of an earlier conversion, tried before the closed form."""
+    """Gaussians of an earlier conversion, tried before the closed form.
 
-    @abstractmethod
+    Attributes:
+        name: what is skipped where they are not taken.
+    """
+
+    name: ClassVar[str]
+
     def try_start(self, work: Work, plan: Plan, request: ConvertRequest) -> bool:
         """Derive the Gaussians of ``work`` from the earlier ones, and return whether they are as good as new ones.
 
-        If they are not, ``work`` is reset.
+        If they are, only scores remain of ``plan``, of the whole if these are asked for; else ``work`` is reset.
         """
+        why = self.obstacle(work, plan, request)
+        if why is None:
+            plan.stages = [s for s in plan.stages if isinstance(s, TestViews) or (s.scores and request.scored_whole)]
+            return True
+        work.reset()
+        if why:
+            work.run.skip(self.name, why)
+        return False
+
+    @abstractmethod
+    def obstacle(self, work: Work, plan: Plan, request: ConvertRequest) -> str | None:
+        """Derive the Gaussians of ``work``; return the reason why they are not taken, "" if there is nothing to say."""
 
     def renderer(self, views: ViewRenderer) -> ViewRenderer | None:
         """Return the renderer to convert by, which caches pictures of ``views``; None for no other."""

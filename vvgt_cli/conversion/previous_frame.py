@@ -15,7 +15,6 @@ from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import CheckViews, TrainingViews
 from vvgt_cli.conversion.stages.refinement import Refinement, refine, widen_small
-from vvgt_cli.conversion.stages.scores import TestViews
 from vvgt_cli.defaults import WARM_STEPS
 from vvgt_cli.field.field import Picture, ViewRenderer
 from vvgt_cli.field.source import StyledVolume
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
     from vvgt_cli.dvr import RenderSettings
 
 
-WARM_START = "starting from the previous frame"
 ROUNDS = 2  # of `WARM_STEPS` at most
 LEVEL = 0.25 / 255  # difference of a pixel that counts as none
 VIEWS = 18  # training views per frame, which take turns
@@ -60,12 +58,14 @@ class _Frame:
 
 def previous_frame(request: ConvertRequest, shards: int = 1) -> PreviousFrame | None:
     """Return the warm start of a series in ``shards`` shards; None where each frame is converted from scratch."""
-    limited = request.limits.target_psnr is not None or request.limits.time_budget is not None
-    return None if request.live or request.checkpoint or limited or shards > 1 else PreviousFrame(request.fit.screen)
+    cold = request.live or request.checkpoint or request.fit.ended or shards > 1
+    return None if cold else PreviousFrame(request.fit.screen)
 
 
 class PreviousFrame(WarmStart):
     """The Gaussians of the previous frame, and its pictures, up to ``size`` pixels along an edge."""
+
+    name = "starting from the previous frame"
 
     def __init__(self, size: int) -> None:
         """Start without a previous frame."""
@@ -91,32 +91,29 @@ class PreviousFrame(WarmStart):
         pictures = self._pictures.new_bytes([view for stage in plan.stages for view in stage.views(fit)]) if sets else 0
         return pictures, lambda workload: sets * workload.gaussians * (A_SET + 12 * ((workload.degree + 1) ** 2 - 1))
 
-    def try_start(self, work: Work, plan: Plan, request: ConvertRequest) -> bool:
-        """Implement `WarmStart.try_start`."""
+    def obstacle(self, work: Work, plan: Plan, request: ConvertRequest) -> str | None:
+        """Implement `WarmStart.obstacle`."""
         self._moved = None
         last, self._last = self._last, None
         lighting = work.field.source.lighting
         if last is None or (lighting is not None and lighting.sky is not None):  # shadows reach far
             self._pictures.invalidate(None)
-            return False
+            return ""
         with work.run.stage("differences") as stage:
             differing = changes(last.source, work.field.source)
             free = differing.meet(last.gaussians)
             self._pictures.invalidate(differing)
             stage.note = f"{differing.blocks.mean():.1%} of the volume, {int(free.sum())} of {len(free)} Gaussians"
-        work.gaussians = last.gaussians
-        if differing.blocks.any() and not self._fitted(work, last, differing, free):
-            work.reset()
-            return False
-        shown = last.shown
-        if differing.blocks.any():  # else no view was drawn
+        work.gaussians, shown = last.gaussians, last.shown
+        if differing.blocks.any():  # else no view is drawn
+            if worse := self._refine(work, last, differing, free):
+                return worse
             turn = self._turn % len(shown)
             shown = (*shown[:turn], work.current(), *shown[turn + 1 :])
             self._turn += 1
         self._last = replace(last, source=work.field.source, gaussians=work.current(), shown=shown)
         self._moved = _count_differing(last.gaussians, work.current())
-        plan.stages = [s for s in plan.stages if isinstance(s, TestViews) or (s.scores and request.scored_whole)]
-        return True
+        return None
 
     def keep(self, work: Work, plan: Plan) -> None:
         """Store a frame that started cold, if it was fitted to views."""
@@ -130,8 +127,8 @@ class PreviousFrame(WarmStart):
                 work.field.source, made, work.psnr(made), cameras, work.train_rule, work.train_settings, shown
             )
 
-    def _fitted(self, work: Work, last: _Frame, differing: Changes, free: np.ndarray) -> bool:
-        """Refine the Gaussians that are ``free`` (K,) bool, and return whether the result is good enough."""
+    def _refine(self, work: Work, last: _Frame, differing: Changes, free: np.ndarray) -> str | None:
+        """Refine the Gaussians that are ``free`` (K,) bool; return why they are not good enough, None if they are."""
         from vvgt_cli.dvr import render_views
 
         turn, turns = self._turn % len(last.shown), len(last.shown)
@@ -141,8 +138,7 @@ class PreviousFrame(WarmStart):
         work.field.views.expect([*check.views(work.fit), *(Picture(camera, last.settings) for camera in cameras)])
         check.run(work)
         if work.psnr(last.gaussians) < last.psnr - FAR:
-            work.run.skip(WARM_START, "the frame differs too much")
-            return False
+            return "the frame differs too much"
         with work.run.stage("views") as stage:
             before = [self._pictures.last(Picture(camera, last.settings)) for camera in cameras]
             images = render_views(work.field.views, cameras, last.settings)
@@ -164,10 +160,8 @@ class PreviousFrame(WarmStart):
             work.gaussians = _moved(last.gaussians, result, free)
             psnr = work.psnr(work.gaussians)
             if psnr >= last.psnr - WORSE or work.run.report.interrupted:
-                return True
-        worse = f"{last.psnr - psnr:.1f} dB worse on the check views than the last frame without"
-        work.run.skip(WARM_START, worse)
-        return False
+                return None
+        return f"{last.psnr - psnr:.1f} dB worse on the check views than the last frame without"
 
 
 def _keep_unchanged(image: np.ndarray, old: np.ndarray | None, shown: Gaussians, camera: Camera, rule: Rule) -> None:

@@ -31,35 +31,30 @@ FAINT = 1e-3  # share of the mean extinction below which a colour means nothing
 MAX_RATIO = 50.0  # greatest ratio of extinctions
 OTHER = 0.5  # distance of colours from which nothing of the earlier descent is kept
 OPAQUE = 1e-5, 0.9999  # least and largest opacity
-WARM_START = "starting from the earlier conversion"
 GRADIENT = slice(5, 8)  # columns of samples
 
 
 class PreviousLook(WarmStart):
     """The Gaussians of an earlier conversion of the same volume, recoloured and refined by a few steps."""
 
+    name = "starting from the earlier conversion"
+
     def __init__(self, earlier: Conversion) -> None:
         """Start from ``earlier``."""
         self.earlier = earlier
 
-    def try_start(self, work: Work, plan: Plan, request: ConvertRequest) -> bool:
-        """Implement `WarmStart.try_start`; raise UsageError if the earlier conversion is of another volume."""
-        why = self._obstacle(work, request)
-        if why is None:
-            work.run.compile(LIVE, work.field.source.kernel_type())
-            with work.run.stage("earlier") as stage:
-                work.gaussians = as_stored(recolor_earlier(self.earlier, work.field))
-                stage.note = f"{len(work.gaussians)} Gaussians of {self.earlier.field.source.name} under the new look"
-            why = self._refine(work, plan)
-        if why is None:
-            plan.stages = [s for s in plan.stages if isinstance(s, TestViews) or (s.scores and request.scored_whole)]
-        else:
-            work.reset()
-            work.run.skip(WARM_START, why)
-        return why is None
+    def obstacle(self, work: Work, plan: Plan, request: ConvertRequest) -> str | None:
+        """Implement `WarmStart.obstacle`; raise UsageError if the earlier conversion is of another volume."""
+        if why := self._unlike(work, request):
+            return why
+        work.run.compile(LIVE, work.field.source.kernel_type())
+        with work.run.stage("earlier") as stage:
+            work.gaussians = as_stored(recolor_earlier(self.earlier, work.field))
+            stage.note = f"{len(work.gaussians)} Gaussians of {self.earlier.field.source.name} under the new look"
+        return self._refine(work, plan)
 
-    def _obstacle(self, work: Work, request: ConvertRequest) -> str | None:
-        """Return the reason against a warm start; None for none."""
+    def _unlike(self, work: Work, request: ConvertRequest) -> str | None:
+        """Return the reason against recolouring; None for none."""
         field, before = work.field, self.earlier.field
         sources, refinement = (before.source, field.source), self.earlier.report.refinement
         if any(source.gridded for source in sources):
@@ -98,7 +93,7 @@ class PreviousLook(WarmStart):
         made = work.run.report.refinement
         assert made is not None
         made["standard"] = standard
-        if made["reason"] == "steps" and made["psnr_after"] < (work.limits.target_psnr or -math.inf):
+        if made["reason"] == "steps" and made["psnr_after"] < (work.fit.target_psnr or -math.inf):
             return "more steps for --target-psnr"
         if made["reason"] == "steps" and made["psnr_after"] < standard - WORSE:
             return f"{standard - made['psnr_after']:.1f} dB worse on the check views than the last conversion without"

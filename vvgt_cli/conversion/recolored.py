@@ -1,63 +1,24 @@
-"""Recolouring of live Gaussians, which carry data values, under a transfer function and without the volume."""
+"""Live Gaussians, which carry data values, under a transfer function and without the volume; their MIP and X-ray."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vvgt_cli.cameras import Camera
 from vvgt_cli.cameras.sets import SIZE, pixel_width
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.field.source import layer_words
+from vvgt_cli.field.source import SourceRequest, StyledVolume
 from vvgt_cli.gaussians import MIN_ALPHA, Gaussians, PlyHeader, PlyOptions
 from vvgt_cli.gaussians.header import FileFacts, legend_text
 from vvgt_cli.gaussians.live import LayerTables, Looks, Palette, Table, apply_look, visible_under
 from vvgt_cli.gaussians.live_facts import AXIS, LiveFacts
 from vvgt_cli.look import LabelTable, Lighting, LightOptions, TransferFunction, check_labels
 from vvgt_cli.look.resolve import unit_of_values
+from vvgt_cli.look.tables import exposed_distance
 from vvgt_cli.volume import Volume
-
-
-@dataclass(frozen=True)
-class FunctionRequest:
-    """A look, as the options of commands give it.
-
-    Attributes:
-        tf: file or colour-map name, or a function; None: the function of the file.
-        tf_range: "data", "rescale" or "LO,HI".
-        unit_distance: a length, "paraview", "mean-spacing", or None: the function's own, else "paraview".
-        labels: for a label map, a table of labels, its file, or "auto"; None: the table of the file.
-        light: options of the light; without options that of a new look (of the first layer's), else that of the
-            Gaussians' file.
-        layers: for a file of several layers or channels, looks of some of them; the others keep theirs.
-    """
-
-    tf: str | TransferFunction | None = None
-    tf_range: str = "data"
-    unit_distance: str | None = None
-    labels: str | LabelTable | None = None
-    light: LightOptions = field(default_factory=LightOptions)
-    layers: tuple[LayerLook, ...] = ()
-
-    def paths(self) -> list[str]:
-        """Return the paths of the files that it names."""
-        given = [self.tf, self.labels, *(look for one in self.layers for look in (one.tf, one.labels))]
-        return [path for path in given if isinstance(path, str) and path != "auto"]
-
-
-@dataclass(frozen=True)
-class LayerLook:
-    """The look of one of several layers; other attributes as in `FunctionRequest`.
-
-    Attributes:
-        layer: its number, its name, or a unique part of the name.
-    """
-
-    layer: str
-    tf: str | TransferFunction | None = None
-    labels: str | LabelTable | None = None
-    unit_distance: str | None = None
 
 
 @dataclass(frozen=True)
@@ -75,16 +36,11 @@ class SeveralLooks:
 Look = TransferFunction | LabelTable | SeveralLooks
 
 
-def parse_layer_look(text: str) -> LayerLook:
-    """Parse ``LAYER[,tf=TF][,iso=LEVEL][,labels=TABLE][,distance=D]``; raise UsageError for other texts."""
-    name, *rest = layer_words(text)
-    given = dict(entry.split("=", 1) for entry in rest if "=" in entry)
-    unknown = set(given) - {"tf", "labels", "distance"} or len(given) < len(rest)
-    if not name or not rest or unknown or not all(given.values()):
-        raise UsageError(
-            f"--layer {text}: expected LAYER,tf=TF, LAYER,iso=LEVEL or LAYER,labels=TABLE, and perhaps distance=LENGTH"
-        )
-    return LayerLook(name, given.get("tf"), given.get("labels"), given.get("distance"))
+def looks_of(source: StyledVolume) -> Look:
+    """Return the look of a source: of one layer its function or label table, else those of all layers."""
+    if len(source.layers) == 1:
+        return source.tf
+    return SeveralLooks(tuple((layer.tf, layer.unit_distance) for layer in source.layers))
 
 
 def apply_function(
@@ -142,16 +98,24 @@ def visible_cloud(gaussians: Gaussians, table: Looks, lighting: Lighting | None,
     assert seen.live is not None
     shown = apply_look(seen, table, pixel)
     there = np.flatnonzero(shown.opacity >= MIN_ALPHA)
-    shown, axis = shown.take(there), seen.live[there, AXIS]
-    if lighting is None:
-        return shown
+    return lit(shown.take(there), seen.live[there, AXIS], lighting)
+
+
+def lit(gaussians: Gaussians, axis: np.ndarray, lighting: Lighting | None) -> Gaussians:
+    """Return Gaussians with their colours under a light in their frame; ``axis`` (K, 3) is that of their normals."""
     from vvgt_cli.closed_form.relight import relight
 
-    return relight(shown, axis, lighting)
+    return gaussians if lighting is None else relight(gaussians, axis, lighting)
 
 
-def resolve_look(name: str, header: PlyHeader | PlyOptions, function: FunctionRequest) -> tuple[Look, PlyOptions]:
+def resolve_look(name: str, header: PlyHeader | PlyOptions, function: SourceRequest) -> tuple[Look, PlyOptions]:
     """Resolve a look on the data values or labels of a file, and return it with the layout of a file of that look.
+
+    Args:
+        name: name of the file, for errors.
+        header: its header; what the request leaves open (function, table, distance, light) is that of the file.
+        function: request of a look for no volume. Its ``layers`` are those of the file, by number, name or a part of
+            it as their ``volume``; the others keep their looks.
 
     Raises:
         DataError: a file without values, an unreadable function, or one that shows nothing of the range of values.
@@ -166,7 +130,7 @@ def resolve_look(name: str, header: PlyHeader | PlyOptions, function: FunctionRe
     if header.live.others:
         return _several(name, header, function)
     if function.layers:
-        first = function.layers[0].layer
+        first = function.layers[0].path
         raise UsageError(f"{name}: has one layer; expected --tf or --labels instead of --layer {first}")
     own, shown, distance, label = _layer_look(name, header, header.live, function, header.unit_distance)
     if isinstance(shown, LabelTable):
@@ -178,7 +142,7 @@ def resolve_look(name: str, header: PlyHeader | PlyOptions, function: FunctionRe
 
 
 def _layer_look(
-    name: str, header: PlyHeader | PlyOptions, facts: LiveFacts, function: FunctionRequest, recorded: float | None
+    name: str, header: PlyHeader | PlyOptions, facts: LiveFacts, function: SourceRequest, recorded: float | None
 ) -> tuple[Lighting | None, TransferFunction | LabelTable, float, str]:
     """Return the light of a new look, the look on the layer's values, its unit distance, and how that was chosen.
 
@@ -210,7 +174,7 @@ def _options(
     )  # fmt: skip
 
 
-def _several(name: str, header: PlyHeader | PlyOptions, function: FunctionRequest) -> tuple[SeveralLooks, PlyOptions]:
+def _several(name: str, header: PlyHeader | PlyOptions, function: SourceRequest) -> tuple[SeveralLooks, PlyOptions]:
     """Return the looks of several layers: those that are given, and the file's for the others."""
     assert header.live is not None
     layers = header.live.layers
@@ -221,12 +185,11 @@ def _several(name: str, header: PlyHeader | PlyOptions, function: FunctionReques
             f"{name}: has {len(layers)} layers, each with its own look, as --layer LAYER,tf=TF; remove "
             f"{' and '.join(given)}; {_listed(layers)}"
         )
-    asked = {layer_number(name, layers, one.layer): one for one in function.layers}
-    placed = []
-    for k, layer in enumerate(layers):
-        one = asked.get(k, LayerLook(""))
-        request = FunctionRequest(one.tf, "data", one.unit_distance, one.labels)
-        placed.append(_layer_look(f"{name}, layer {k}", header, layer, request, layer.distance))
+    asked = {layer_number(name, layers, one.path): one for one in function.layers}
+    placed = [
+        _layer_look(f"{name}, layer {k}", header, layer, asked.get(k, SourceRequest("")), layer.distance)
+        for k, layer in enumerate(layers)
+    ]
     light = light_of(function.light, placed[0][0] or header.light, header.space)
     looks = SeveralLooks(tuple((shown, distance) for _, shown, distance, _ in placed))
     return looks, _options(header, looks, *placed[0][2:], light)
@@ -245,20 +208,20 @@ def layer_number(name: str, layers: Sequence[LiveFacts], asked: str) -> int:
 
 def layer_look(
     header: PlyHeader | PlyOptions, key: int | str, look: str | TransferFunction | LabelTable
-) -> LayerLook:  # fmt: skip
-    """Return the look of a layer, a label table for labels and a function for values; raise UsageError for no layer."""
+) -> SourceRequest:  # fmt: skip
+    """Return the request for a layer, a table for labels and a function for values; raise UsageError for no layer."""
     layers = () if header.live is None else header.live.layers
     labels = bool(layers) and bool(layers[layer_number("result", layers, str(key))].labels)
     if isinstance(look, TransferFunction) or (isinstance(look, str) and not labels):
-        return LayerLook(str(key), tf=look)
-    return LayerLook(str(key), labels=look)
+        return SourceRequest(str(key), tf=look)
+    return SourceRequest(str(key), labels=look)
 
 
 def _listed(layers: Sequence[LiveFacts]) -> str:
     return "expected " + ", ".join(f"{k} ({layer.name})" for k, layer in enumerate(layers))
 
 
-def _function(name: str, facts: LiveFacts, function: FunctionRequest) -> tuple[TransferFunction, TransferFunction]:
+def _function(name: str, facts: LiveFacts, function: SourceRequest) -> tuple[TransferFunction, TransferFunction]:
     """Return a function as given, and on the data values of a file."""
     from vvgt_cli.look import read_transfer_function, resolve
     from vvgt_cli.look.resolve import parse_tf_range
@@ -271,7 +234,7 @@ def _function(name: str, facts: LiveFacts, function: FunctionRequest) -> tuple[T
     return tf, resolve(tf, facts.statistics(), tf_range, facts.unit == "HU" or given is None)
 
 
-def _table(name: str, facts: LiveFacts, function: FunctionRequest) -> tuple[LabelTable, LabelTable]:
+def _table(name: str, facts: LiveFacts, function: SourceRequest) -> tuple[LabelTable, LabelTable]:
     """Return the table of labels as given and as used, which are the same."""
     from vvgt_cli.look.label_files import table_for
 
@@ -310,14 +273,55 @@ def grid_of(name: str, header: FileFacts) -> Volume:
 
 
 def recolored(
-    name: str, gaussians: Gaussians, header: PlyHeader, function: FunctionRequest | None, empty: bool = False
-) -> Gaussians:
-    """Return the Gaussians of a file under the function that is given, unchanged without one.
+    name: str, gaussians: Gaussians, header: PlyHeader | PlyOptions, function: SourceRequest, empty: bool = False
+) -> tuple[Gaussians, PlyOptions]:
+    """Return the Gaussians of a file under a function, and the layout of a file of them.
 
     Raises:
         DataError, UsageError: see `resolve_look` and `apply_function`; a range or a distance without a function.
     """
-    if function is None:
-        return gaussians
     tf, options = resolve_look(name, header, function)
-    return apply_function(gaussians, header, tf, options, empty)
+    return apply_function(gaussians, header, tf, options, empty), options
+
+
+MIP, XRAY = "mip", "xray"
+NAMES = MIP, XRAY
+NO_GRAIN = 1e-6  # part of a voxel over which values cover the background: an X-ray adds up extinction
+Draw = Callable[[Camera], np.ndarray]
+
+
+def grey(values: np.ndarray) -> np.ndarray:
+    """Return values (h, w) as an opaque picture (h, w, 4) float32."""
+    picture = np.ones((*values.shape, 4), np.float32)
+    picture[..., :3] = values[..., None]
+    return picture
+
+
+def draw_gaussians(
+    name: str, gaussians: Gaussians, header: PlyHeader | PlyOptions, rule: str, function: SourceRequest | None = None,
+    edge: float = 2.0,
+) -> Draw:  # fmt: skip
+    """Return the function that draws live Gaussians; ``edge``, of their frame, is that of `exposed_distance`.
+
+    Raises:
+        DataError: Gaussians that carry no values, labels, or several layers; see also `resolve_look`.
+        UsageError: a look for a MIP, which shows the values alone.
+    """
+    from vvgt_cli.splat.grey import mip, xray
+
+    facts = header.live
+    if facts is None or facts.others or facts.labels:
+        what = "carry no values" if facts is None else "carry labels" if facts.labels else "are of several layers"
+        raise DataError(
+            f"{name}: --rule {rule}: its Gaussians {what}; expected a .ply that 'vvgt convert --live' makes of one "
+            "volume of values"
+        )
+    if rule == MIP:
+        if function is not None:
+            raise UsageError(f"--rule {MIP}: shows values, whatever their look; omit function and light")
+        return lambda camera: grey(mip(gaussians, camera, facts.lo, facts.hi))
+    tf, _ = resolve_look(name, header, function or SourceRequest(""))
+    assert isinstance(tf, TransferFunction)
+    distance = exposed_distance(tf, facts.statistics(), edge)
+    table = Table.of_function(tf, facts.lo, facts.hi, distance, facts.grain * NO_GRAIN)
+    return lambda camera: grey(xray(gaussians, table, camera))

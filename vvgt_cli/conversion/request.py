@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 from vvgt_cli.conversion.place import AUTO
@@ -28,7 +28,7 @@ HEADER_BYTES = {0: 3600, 1: 3800, 2: 4200, 3: 4800}  # a legend takes up to 2500
 
 @dataclass(frozen=True)
 class FitOptions:
-    """Options of the fit: budget, screen, method, steps.
+    """Options of the fit: budget, screen, method, steps, and limits of error, time and size.
 
     Attributes:
         max_gaussians: maximum number of Gaussians.
@@ -40,6 +40,12 @@ class FitOptions:
         steps: maximum number of steps of gradient descent; None: the default.
         device: "cpu", or "cuda" for views and steps.
         target: name of the device that the file is made for (`vvgt_cli.gaussians.targets`), None for none.
+        target_psnr: PSNR (dB) on the check views at which to stop.
+        time_budget: wall seconds of the whole run, from the start of reading on.
+        max_megabytes: maximal size of the file, 10^6 bytes.
+
+    Raises:
+        UsageError: a limit is out of range.
     """
 
     max_gaussians: int = MAX_GAUSSIANS
@@ -51,33 +57,6 @@ class FitOptions:
     model: str | None = None
     device: str = "cpu"
     target: str | None = None
-
-    @classmethod
-    def of(cls, target: str | None = None, **given: Any) -> FitOptions:
-        """Return the options that are given and not None; others are the target's, or the defaults.
-
-        Raises:
-            UsageError: there is no such target.
-        """
-        device = target_of(target)
-        names = ("max_gaussians", "screen", "rule") if device else ()
-        known = {name: getattr(device, name) for name in names}
-        return cls(target=target, **known | {name: value for name, value in given.items() if value is not None})
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Limits that a user may set.
-
-    Attributes:
-        target_psnr: PSNR (dB) on the check views at which to stop.
-        time_budget: wall seconds of the whole run, from the start of reading on.
-        max_megabytes: maximal size of the file, 10^6 bytes.
-
-    Raises:
-        UsageError: a limit is out of range.
-    """
-
     target_psnr: float | None = None
     time_budget: float | None = None
     max_megabytes: float | None = None
@@ -96,20 +75,17 @@ class Limits:
         """Return whether a target or a time budget ends descent."""
         return self.target_psnr is not None or self.time_budget is not None
 
-    def gaussians(self, most: int, header: float, each: float) -> int:
-        """Return how many Gaussians of ``each`` bytes budget and file size allow after a header.
+    @classmethod
+    def of(cls, target: str | None = None, **given: Any) -> FitOptions:
+        """Return the options that are given and not None; others are the target's, or the defaults.
 
-        Raise UsageError if none.
+        Raises:
+            UsageError: there is no such target.
         """
-        if self.max_megabytes is None:
-            return most
-        fit = int((self.max_megabytes * 1e6 - header) // each)
-        if fit < 1:
-            least = (header + each) / 1e6
-            raise UsageError(
-                f"--max-megabytes {self.max_megabytes:g}: no Gaussian fits; expected {least:.4f} MB or more"
-            )
-        return min(most, fit)
+        device = target_of(target)
+        names = ("max_gaussians", "screen", "rule") if device else ()
+        known = {name: getattr(device, name) for name in names}
+        return cls(target=target, **known | {name: value for name, value in given.items() if value is not None})
 
 
 def file_bytes(gaussians: int, sh_degree: int) -> int:
@@ -124,8 +100,7 @@ class ConvertRequest:
     Attributes:
         source: volume and look to read.
         output: file to write, any of `vvgt_cli.gaussians.formats`, "-" for a `.ply` on standard output, None for none.
-        fit: options of the fit.
-        limits: limits of error, time and size.
+        fit: options of the fit, and limits of error, time and size.
         ply: layout of the file; up, the volume's place and the unit distance follow from the source.
         up: world axis or anatomical direction that viewers show upwards, "none", or "auto" (superior in the unit frame
             of an anatomical space).
@@ -147,7 +122,6 @@ class ConvertRequest:
     source: SourceRequest
     output: str | None = None
     fit: FitOptions = field(default_factory=FitOptions)
-    limits: Limits = field(default_factory=Limits)
     ply: PlyOptions = field(default_factory=PlyOptions)
     up: str = AUTO
     report: str | None = None
@@ -177,20 +151,26 @@ class ConvertRequest:
         if is_page(self.output):
             header, each = page_bytes(degree)
             header += (SMALLEST_VALUES if self.values else 0) + (self.story.size if self.story else 0)
-        elif self.limits.max_megabytes is not None and (known is not None or is_streamed(self.output)):
+        elif self.fit.max_megabytes is not None and (known is not None or is_streamed(self.output)):
             raise UsageError(
                 f"--max-megabytes needs .ply or .html output; got -o {self.output}; try --max-gaussians instead"
             )
         else:
             header, each = file_bytes(0, degree), file_bytes(1, degree) - file_bytes(0, degree)
-        return replace(self.limits, max_megabytes=self.megabytes).gaussians(self.fit.max_gaussians, header, each)
+        if self.megabytes is None:
+            return self.fit.max_gaussians
+        room = int((self.megabytes * 1e6 - header) // each)
+        if room < 1:
+            least = (header + each) / 1e6
+            raise UsageError(f"--max-megabytes {self.megabytes:g}: no Gaussian fits; expected {least:.4f} MB or more")
+        return min(self.fit.max_gaussians, room)
 
     @property
     def megabytes(self) -> float | None:
         """Return the limit of the file's size: the given one, or the target's for files that have such a limit."""
         target, known = target_of(self.fit.target), format_of(self.output or "")
-        if self.limits.max_megabytes is not None or target is None:
-            return self.limits.max_megabytes
+        if self.fit.max_megabytes is not None or target is None:
+            return self.fit.max_megabytes
         limited = not self.live if known is None else is_page(self.output)
         return target.megabytes if limited and not (self.shares_output or is_streamed(self.output)) else None
 

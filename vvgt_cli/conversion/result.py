@@ -151,12 +151,15 @@ class Result:
             DataError: they carry no values, or the function shows nothing of them.
             UsageError: an invalid range, distance or light.
         """
-        from vvgt_cli.conversion.recolored import FunctionRequest, apply_function, layer_look, resolve_look
+        from vvgt_cli.conversion.recolored import layer_look, recolored
+        from vvgt_cli.field.source import SourceRequest
 
         others = tuple(layer_look(self.ply, key, one) for key, one in (layers or {}).items())
-        asked = FunctionRequest(tf, tf_range, opacity_unit_distance, labels, light or LightOptions(), others)
-        function, options = resolve_look("result", self.ply, asked)
-        found = apply_function(self.gaussians, self.ply, function, options)
+        asked = SourceRequest(
+            "", tf=tf, tf_range=tf_range, unit_distance=opacity_unit_distance, labels=labels,
+            light=light or LightOptions(), layers=others,
+        )  # fmt: skip
+        found, options = recolored("result", self.gaussians, self.ply, asked)
         return Result(found, ConversionReport("recolor"), options)
 
     def voxelize(
@@ -205,7 +208,7 @@ class Result:
             UsageError: the rule is unknown.
             DataError: a MIP or X-ray of Gaussians without values.
         """
-        from vvgt_cli.conversion.grey import NAMES, draw_gaussians
+        from vvgt_cli.conversion.recolored import NAMES, draw_gaussians
         from vvgt_cli.splat import render
 
         if camera is None:

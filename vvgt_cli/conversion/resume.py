@@ -26,7 +26,7 @@ from vvgt_cli.refine.checkpoint import load_archive
 from vvgt_cli.version import VERSION
 
 if TYPE_CHECKING:
-    from vvgt_cli.conversion.request import FitOptions, Limits
+    from vvgt_cli.conversion.request import FitOptions
     from vvgt_cli.field.field import Field
 
 CLOSED_FORM, CELLS, FITTED = "closed-form.npz", "cells.npz", "fitted.npz"
@@ -115,7 +115,7 @@ def checkpoint_folder(folder: str | None) -> Iterator[None]:
             Path(folder).rmdir()  # fails where it is not empty
 
 
-def checkpoint_of(folder: str | None, field: Field, fit: FitOptions, limits: Limits) -> Checkpoint:
+def checkpoint_of(folder: str | None, field: Field, fit: FitOptions) -> Checkpoint:
     """Return a conversion's checkpoint, keyed by all that it depends on; raise DataError if its model is unreadable."""
     if folder is None:
         return Checkpoint()
@@ -127,7 +127,6 @@ def checkpoint_of(folder: str | None, field: Field, fit: FitOptions, limits: Lim
         "opacity_unit_distance": source.unit_distance,
         "light": None if source.lighting is None else source.lighting.key(),
         **asdict(fit),
-        **asdict(limits),
         "model": read_text(find_model(fit.model) / CARD) if fit.model else None,
     }
     return Checkpoint(Path(folder), digest(json.dumps(depends, sort_keys=True)))

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
-from vvgt_cli.conversion.request import FitOptions, Limits
+from vvgt_cli.conversion.request import FitOptions
 from vvgt_cli.conversion.resume import Checkpoint
 from vvgt_cli.field.workload import Workload
 from vvgt_cli.gaussians import Gaussians, PlyOptions, Rule, rule_of
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from vvgt_cli.cameras import Camera
     from vvgt_cli.closed_form import Start
-    from vvgt_cli.conversion.stored import FinishedParts, Levels
+    from vvgt_cli.conversion.cut import FinishedParts, Levels
     from vvgt_cli.dvr import RenderSettings
     from vvgt_cli.field.field import Field, Picture
 
@@ -39,7 +39,7 @@ class Work:
     Attributes:
         run: times stages and prints messages.
         field: the volume under its function, labels, layers and light.
-        fit, limits: options of the conversion.
+        fit: options and limits of the conversion.
         degree: degree of the harmonics of colours where the light depends on the view.
         checkpoint: where stages save their results; without a folder nowhere.
         ending: expected seconds of the stages after the current one.
@@ -59,7 +59,6 @@ class Work:
     run: Run
     field: Field
     fit: FitOptions
-    limits: Limits = dataclasses.field(default_factory=Limits)
     degree: int = 0
     checkpoint: Checkpoint = dataclasses.field(default_factory=Checkpoint)
     ending: float = 0.0
@@ -112,13 +111,14 @@ class Work:
 
     def target_reached(self) -> bool:
         """Return whether the target PSNR is reached."""
-        target = self.limits.target_psnr
+        target = self.fit.target_psnr
         return target is not None and self.check is not None and self.psnr(self.current()) >= target
 
-    def keep_better(self, record: StageRecord, before: float, gaussians: Gaussians) -> None:
-        """Take ``gaussians`` if their PSNR is better than ``before`` (dB), and record both."""
+    def keep_better(self, record: StageRecord, gaussians: Gaussians, how: str) -> None:
+        """Take ``gaussians`` if their PSNR is better than that of the current ones, and record both, and ``how``."""
+        before = self.psnr(self.current())
         record.psnr_before, record.psnr = before, self.psnr(gaussians)
-        record.kept = record.psnr > before
+        record.kept, record.note = record.psnr > before, f"{how}; from {before:.2f} dB on the check views"
         self.gaussians = gaussians if record.kept else self.gaussians
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, NoLiveForm
-from vvgt_cli.look import ColorMap, Label, LabelTable, PiecewiseOpacity, TransferFunction, merge_labels
+from vvgt_cli.look import ColorMap, Label, LabelTable, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.look.resolve import unit_of_values
 from vvgt_cli.look.to_json import to_text
@@ -121,6 +121,13 @@ class LiveFacts:
             "comment vvgt live function " + self.function,
         ]
 
+    def shown_like(self, other: LiveFacts) -> bool:
+        """Return whether another file can be shown alike: as many layers, of labels or of one range and function."""
+        looks = [
+            [bool(one.labels) or (one.lo, one.hi, one.function) for one in facts.layers] for facts in (self, other)
+        ]
+        return looks[0] == looks[1]
+
     def title(self) -> str:
         """Return the comment line that introduces one of several layers."""
         return f"comment vvgt live layer {self.distance!r} {json.dumps(self.name)}"
@@ -184,27 +191,3 @@ def live_facts(layers: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> L
         return None
     first, *others = [LiveFacts(**one) for one in layers]
     return replace(first, others=tuple(others))
-
-
-def shared_facts(facts: Sequence[LiveFacts | None]) -> LiveFacts | None:
-    """Return common facts about the values of several files, None if they cannot be shown alike.
-
-    The files must have the same number of layers, and values of the same range under the same function. The labels of
-    label maps are merged: a number may have several names, each with the look of the first file that has it.
-    """
-    known = [one.layers for one in facts if one is not None]
-    if len(known) < len(facts) or len({len(layers) for layers in known}) > 1:
-        return None
-    first, *others = [_shared_layer(same) for same in zip(*known, strict=True)]
-    if first is None or None in others:
-        return None
-    return replace(first, others=tuple(one for one in others if one is not None))
-
-
-def _shared_layer(facts: Sequence[LiveFacts]) -> LiveFacts | None:
-    """Return common facts about one layer of each file, None if there are none."""
-    first = facts[0]
-    if all(one.labels for one in facts):
-        return replace(first, labels=merge_labels(label for one in facts for label in one.labels))
-    looks = {(bool(one.labels), one.lo, one.hi, one.function) for one in facts}
-    return first if len(looks) == 1 else None

@@ -164,7 +164,7 @@ def _is(right: Callable[[Any], bool], expected: str) -> Check:
     return check
 
 
-def _fields(**checks: Check) -> Check:
+def fields(**checks: Check) -> Check:
     """Return a check of an object."""
 
     def check(value: Any, where: str) -> None:
@@ -182,16 +182,20 @@ WHOLE = _is(lambda x: isinstance(x, int) and not isinstance(x, bool) and x >= 0,
 FLAG = _is(lambda value: isinstance(value, bool), "true or false")
 SHARE, WITHIN, LIGHT = _number(0, 1), _number(0, 1, ", outside the volume"), _number(0, MAX_LIGHT)
 DIRECTION = _numbers(3, nonzero=True)
-CAMERA = _fields(
+CAMERA = fields(
     target=_numbers(3), pitch=_number(-90, 90), yaw=_number(), distance=_number(1e-6), orthographic=FLAG
 )  # fmt: skip
-CUT = _fields(
+CUT = fields(
     kind=_among("none", "plane", "box"), normal=DIRECTION, at=WITHIN, flipped=FLAG, box=_numbers(6, WITHIN)
 )  # fmt: skip
-LABEL = _fields(
+LABEL = fields(
     name=_is(lambda x: isinstance(x, str), "a text"), number=WHOLE, opacity=SHARE, color=_numbers(3, SHARE)
 )  # fmt: skip
-SLICES = _fields(at=_numbers(3), window=_number(1e-30), level=_number(), on_cut=FLAG)
+OF_LIGHT = {
+    "kind": _among("none", "headlight", "direction"), "from": DIRECTION, "ambient": LIGHT, "diffuse": LIGHT,
+    "specular": LIGHT,
+}  # fmt: skip
+SLICES = fields(at=_numbers(3), window=_number(1e-30), level=_number(), on_cut=FLAG)
 
 
 def _camera(value: Any, where: str) -> None:
@@ -229,10 +233,7 @@ def _labels(value: Any, where: str) -> None:
 
 CHECKS: dict[str, Check] = {
     "camera": _camera, "cut": _cut, "function": _function, "labels": _labels, "layer": WHOLE, "frame": WHOLE,
-    "light": _fields(**{
-        "kind": _among("none", "headlight", "direction"), "from": DIRECTION, "ambient": LIGHT, "diffuse": LIGHT,
-        "specular": LIGHT,
-    }),
+    "light": fields(**OF_LIGHT),
     "slices": lambda value, where: None if value is True else SLICES(value, where),
     "link": _is(lambda x: isinstance(x, str) and "view=" in x, "what follows # in a link that a page copies"),
 }  # fmt: skip

@@ -25,6 +25,7 @@ try:
     from vvgt_cli.defaults import MAX_GAUSSIANS, STEPS
     from vvgt_cli.integrations.command import Kept, tell
     from vvgt_cli.integrations.paraview_job import Job
+    from vvgt_cli.integrations.paraview_ranks import Ranks
 finally:
     sys.path.remove(ROOT)
 
@@ -113,14 +114,11 @@ class GaussianSplatWriter(VTKPythonAlgorithmBase):
 
     def RequestUpdateExtent(self, request: Any, inputs: Any, outputs: Any) -> int:
         """Ask for the next time step, and for this rank's piece."""
-        from vtkmodules.vtkParallelCore import vtkMultiProcessController
-
-        info, controller = inputs[0].GetInformationObject(0), vtkMultiProcessController.GetGlobalController()
-        pipeline = _pipeline()
+        info, pipeline, ranks = inputs[0].GetInformationObject(0), _pipeline(), Ranks()
         if self.times:
             info.Set(pipeline.UPDATE_TIME_STEP(), self.times[self.step])
-        info.Set(pipeline.UPDATE_NUMBER_OF_PIECES(), controller.GetNumberOfProcesses() if controller else 1)
-        info.Set(pipeline.UPDATE_PIECE_NUMBER(), controller.GetLocalProcessId() if controller else 0)
+        info.Set(pipeline.UPDATE_NUMBER_OF_PIECES(), ranks.count)
+        info.Set(pipeline.UPDATE_PIECE_NUMBER(), ranks.rank)
         return 1
 
     def RequestData(self, request: Any, inputs: Any, outputs: Any) -> int:

@@ -1,11 +1,12 @@
-"""Volumes of a vtkRenderer, and its camera and lights as options of the command; imports the standard library alone."""
+"""Volumes of a vtkRenderer, and its camera and lights as options of the command; imports numpy at most."""
 
 from __future__ import annotations
 
 import math
-import operator
 from collections.abc import Sequence
 from typing import Any
+
+import numpy as np
 
 HEADLIGHT, SCENE = 1, 3  # vtkLight's types; 2 moves with the camera
 
@@ -34,23 +35,17 @@ def camera_of(renderer: Any) -> tuple[str, str, list[str]]:
     axis = max(range(3), key=lambda k: abs(up[k]))
     sign = -1.0 if up[axis] < 0 else 1.0
     upright = [sign * (k == axis) for k in range(3)]
-    if abs(roll := _roll([target[k] - eye[k] for k in range(3)], up, upright)) > 1:
+    if abs(roll := _roll(np.subtract(target, eye), up, upright)) > 1:
         notes.append(f"roll of the camera, {roll:.0f} degrees")
     text = ",".join(repr(float(v)) for v in (*eye, *target, angle))
     return text, ("-" if sign < 0 else "") + "xyz"[axis], notes
 
 
-def _roll(forward: Sequence[float], up: Sequence[float], upright: Sequence[float]) -> float:
+def _roll(forward: np.ndarray, up: Sequence[float], upright: Sequence[float]) -> float:
     """Return the angle, degrees, between two directions as they are seen along a third one."""
-    right = _cross(forward, up)
-    other = _cross(forward, upright)
-    dot, turned = sum(map(operator.mul, right, other)), _cross(right, other)
-    length = math.sqrt(sum(v * v for v in forward)) or 1.0
-    return math.degrees(math.atan2(sum(map(operator.mul, turned, forward)) / length, dot))
-
-
-def _cross(a: Sequence[float], b: Sequence[float]) -> list[float]:
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    right, other = np.cross(forward, up), np.cross(forward, upright)
+    turned = np.cross(right, other) @ forward / (np.linalg.norm(forward) or 1.0)
+    return math.degrees(math.atan2(turned, right @ other))
 
 
 def lights_of(renderer: Any) -> tuple[list[str], list[str]]:

@@ -13,7 +13,6 @@ import numpy as np
 
 from vvgt_cli.conversion.gaussian_files import write_gaussians
 from vvgt_cli.conversion.index import function_name
-from vvgt_cli.conversion.recolored import FunctionRequest, parse_layer_look
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.conversion.result import Result
 from vvgt_cli.errors import UsageError
@@ -289,13 +288,19 @@ def with_look(source: SourceRequest, look: Look) -> SourceRequest:
     return replace(source, **look.asked(), layers=layers)
 
 
-def live_look(look: Look) -> FunctionRequest | None:
+def live_look(look: Look) -> SourceRequest | None:
     """Return the request for live Gaussians under a look, with layers as ``--layer`` of `recolor` has them.
 
     It is None where nothing is asked for; errors as above.
     """
-    asked = FunctionRequest(**look.asked(), layers=tuple(map(parse_layer_look, map(str, look.layers))))
-    return None if asked == FunctionRequest() else asked
+    asked = with_look(SourceRequest(""), look)
+    for layer in asked.layers:
+        if layer == SourceRequest(layer.path) or layer.read != ReadOptions():
+            raise UsageError(
+                f"--layer {layer.path}: expected LAYER,tf=TF, LAYER,iso=LEVEL or LAYER,labels=TABLE, and perhaps "
+                "distance=LENGTH"
+            )
+    return None if asked == SourceRequest("") else asked
 
 
 def labels_of(labels: LabelsLike | None) -> str | LabelTable | None:

@@ -83,23 +83,8 @@ class ViewingPlace(NamedTuple):
     where: str = ""
 
 
-ConditionPicture = tuple[ViewingPlace, Camera, Blocks | None]
-
-
-@dataclass(frozen=True)
-class ConditionView:
-    """The reference of a viewing condition in one view.
-
-    Attributes:
-        place: the condition.
-        camera, blocks: camera of the view, and its blocks that are scored, None for all.
-        reference: (h, w, 3) float32 picture of the blocks, or of the whole.
-    """
-
-    place: ViewingPlace
-    camera: Camera
-    blocks: Blocks | None
-    reference: np.ndarray
+ConditionPicture = tuple[ViewingPlace, Camera, Blocks | None]  # and the blocks that are scored, None for all
+ConditionView = tuple[ConditionPicture, np.ndarray]  # and the reference (h, w, 3) float32 of the blocks, or the whole
 
 
 def condition_pictures(
@@ -165,7 +150,7 @@ def condition_views(
 
     for done, (place, camera, blocks) in enumerate(pictures, 1):
         image = render_view(scene, camera, settings, blocks)[..., :3]
-        yield ConditionView(place, camera, blocks, picked(image, blocks))
+        yield (place, camera, blocks), picked(image, blocks)
         if progress:
             progress(done, len(pictures))
 
@@ -230,10 +215,10 @@ def score_conditions(
     from vvgt_cli.splat import render
 
     errors: dict[tuple[str, ViewingPlace], list[float]] = {}
-    for view in seen:
-        for rule in (headset,) if view.place.where else rules:
-            ours = picked(render(gaussians, view.camera, rule, blocks=view.blocks)[..., :3], view.blocks)
-            errors.setdefault((rule, view.place), []).append(psnr(view.reference, ours))
+    for (place, camera, blocks), reference in seen:
+        for rule in (headset,) if place.where else rules:
+            ours = picked(render(gaussians, camera, rule, blocks=blocks)[..., :3], blocks)
+            errors.setdefault((rule, place), []).append(psnr(reference, ours))
     conditions = [
         ViewingCondition(rule, *place[:2], float(np.mean(dbs)), place.where) for (rule, place), dbs in errors.items()
     ]

@@ -53,10 +53,8 @@ class CellsByError(Stage):
         with run.stage(self.name) as stage:
             chosen = farthest_cameras(train.cameras, VIEWS)  # every fourth or fifth view would lie in bands
             cameras = [train.cameras[i] for i in chosen]
-            before = work.psnr(work.current())
             recut = cut_by_error(work.start, cameras, train.images[chosen], work.train_rule)
-            work.keep_better(stage, before, recut)
-            stage.note = f"{len(recut)} Gaussians, by {len(chosen)} views; from {before:.2f} dB on the check views"
+            work.keep_better(stage, recut, f"{len(recut)} Gaussians, by {len(chosen)} views")
         if self.keep:
             work.checkpoint.save(CELLS, work.current())
 
@@ -82,11 +80,9 @@ class BackProjection(Stage):
         run, train = work.run, work.train
         run.compile(BACK_PROJECT)
         with run.stage(self.name) as stage:
-            before = work.psnr(work.start.gaussians)
             bar = run.console.bar(self.name)
             projected, how = backproject(work.start, train.cameras, train.images, progress=bar, rule=work.train_rule)
-            work.keep_better(stage, before, projected)
-            stage.note = f"{how}; from {before:.2f} dB on the check views"
+            work.keep_better(stage, projected, how)
 
 
 @dataclass(frozen=True)
@@ -124,7 +120,4 @@ class Network(Stage):
             model = Model.open(find_model(self.model), numba.get_num_threads())
             bar, plain = run.console.bar(self.name), given.of_degree(0)  # the network takes no harmonics
             better = model.improve(plain, train.cameras, train.images, progress=bar, rule=work.train_rule)
-            better = replace(better, harmonics=given.harmonics)
-            before = work.psnr(given)
-            work.keep_better(stage, before, better)
-            stage.note = f"{model.card.name}; from {before:.2f} dB on the check views"
+            work.keep_better(stage, replace(better, harmonics=given.harmonics), model.card.name)

@@ -10,13 +10,11 @@ import numpy as np
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.blocks import spread_blocks
-from vvgt_cli.conversion.cut import CutPlan, cut_of, disk_bytes
+from vvgt_cli.conversion.cut import CutPlan, FinishedParts, cut_of, disk_bytes
 from vvgt_cli.conversion.parts import Refiner, choose_levels, closed_form_parts, refined_parts
-from vvgt_cli.conversion.request import Limits
 from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.conversion.stages.closed_form import ClosedFormStage
 from vvgt_cli.conversion.stages.refinement import HARMONICS, early_end, steps_in_time
-from vvgt_cli.conversion.stored import FinishedParts
 from vvgt_cli.field.block_store import CELLS
 from vvgt_cli.field.blocked import Blocked
 from vvgt_cli.field.digests import digest
@@ -24,7 +22,8 @@ from vvgt_cli.field.field import Picture
 from vvgt_cli.field.rays import RayFile, composed
 from vvgt_cli.field.settings import MANY
 from vvgt_cli.field.workload import Workload, pace
-from vvgt_cli.files import atomic_write, check_disk_space
+from vvgt_cli.files import check_disk_space
+from vvgt_cli.gaussians.outputs import write_text
 from vvgt_cli.gaussians.rules import INRIA
 from vvgt_cli.jit.ahead import OPTIMIZE, for_degree
 from vvgt_cli.resources import free_memory
@@ -91,26 +90,25 @@ class OutOfCore(Stage):
 
     def _refiner(self, work: Work, field: Blocked) -> Refiner | None:
         """Return what refines parts by as many steps as there is time for, and a network; None for neither."""
-        fit, limits, steps, run = work.fit, work.limits, self.steps, work.run
-        chosen = field.run_pass.store.folder / f"steps-{digest(steps, limits.time_budget)[:16]}"
+        fit, steps, run = work.fit, self.steps, work.run
+        chosen = field.run_pass.store.folder / f"steps-{digest(steps, fit.time_budget)[:16]}"
         if chosen.is_file():
             steps = int(chosen.read_text("ascii"))
             run.console.message(f"{steps} steps in the time budget, as the interrupted run chose")
-        elif steps and limits.time_budget is not None:
+        elif steps and fit.time_budget is not None:
             each = A_STEP * pace() * HARMONICS[work.degree] * fit.max_gaussians / field.run_pass.runner.workers
-            left = limits.time_budget - run.elapsed() - A_WRITE * fit.max_gaussians
+            left = fit.time_budget - run.elapsed() - A_WRITE * fit.max_gaussians
             steps = steps_in_time(steps, left, lambda steps: steps * each)
             if not steps:
                 run.skip("refinement", f"{max(left, 0.0):.1f} s remain")
-            with atomic_write(chosen, overwrite=True) as temporary:
-                temporary.write_text(str(steps), "ascii")
+            write_text(chosen, str(steps), overwrite=True)
         if not steps and fit.model is None:
             return None
         if fit.device != "cpu":
             run.console.message("steps on parts are taken on the CPU: their pixels have weights, which a GPU ignores")
         run.compile(for_degree(OPTIMIZE, work.degree))
-        plain, target = replace(fit, steps=steps, device="cpu"), Limits(limits.target_psnr)
-        return Refiner(field.reader, field.light, plain, target, early_end(fit, limits))
+        plain = replace(fit, steps=steps, device="cpu", time_budget=None, max_megabytes=None)
+        return Refiner(field.reader, field.light, plain, early_end(fit))
 
 
 def make_blocks(work: Work, field: Blocked) -> None:

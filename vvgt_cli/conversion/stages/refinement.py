@@ -11,7 +11,7 @@ from typing import ClassVar
 import numpy as np
 
 from vvgt_cli.cameras.sets import pixel_width
-from vvgt_cli.conversion.request import FitOptions, Limits
+from vvgt_cli.conversion.request import FitOptions
 from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.defaults import EARLY, FEWEST_STEPS, MAX_STEPS, METHOD, STEPS
 from vvgt_cli.errors import DeviceFailed
@@ -39,19 +39,19 @@ def step_seconds(workload: Workload, small: bool) -> float:
     return HARMONICS[workload.degree] * one
 
 
-def most_steps(fit: FitOptions, limits: Limits) -> int:
+def most_steps(fit: FitOptions) -> int:
     """Return the requested number of steps, else `STEPS`, or `MAX_STEPS` if a target or a time budget ends them."""
     if fit.steps is not None:
         return fit.steps
-    return MAX_STEPS if limits.ended else STEPS
+    return MAX_STEPS if fit.ended else STEPS
 
 
-def early_end(fit: FitOptions, limits: Limits) -> int | None:
+def early_end(fit: FitOptions) -> int | None:
     """Return the steps after which descent may end since nobody sees a difference; None where the user decides.
 
     A network uses all views, so that it ends none early.
     """
-    return None if fit.steps is not None or fit.model is not None or limits.ended else EARLY
+    return None if fit.steps is not None or fit.model is not None or fit.ended else EARLY
 
 
 def steps_in_time(steps: int, left: float | None, seconds: Callable[[int], float]) -> int:
@@ -96,9 +96,9 @@ class Refinement(Stage):
         assert work.check is not None
         assert work.train_rule is not None
         remaining = None
-        if work.limits.time_budget is not None:
-            remaining = max(work.limits.time_budget - work.run.elapsed() - work.ending, 0.0)
-        target = work.limits.target_psnr
+        if work.fit.time_budget is not None:
+            remaining = max(work.fit.time_budget - work.run.elapsed() - work.ending, 0.0)
+        target = work.fit.target_psnr
         options = OptimizeOptions.of(
             "axes", steps=self.most, time_budget=remaining, target_psnr=target, rule=work.train_rule,
             check_rule=work.check_rule, seed=work.fit.seed, checkpoint=work.checkpoint.descent, device=work.fit.device,

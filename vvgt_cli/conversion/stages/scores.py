@@ -133,7 +133,7 @@ class ViewingConditions(Stage):
         """Score the Gaussians."""
         from vvgt_cli.dvr import RenderSettings
 
-        run, budget, fit = work.run, work.limits.time_budget, work.fit
+        run, budget, fit = work.run, work.fit.time_budget, work.fit
         if budget is not None and run.elapsed() > budget:
             run.skip(self.name, "time is up")
             return

@@ -14,10 +14,10 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, read_ply
 from vvgt_cli.gaussians.formats import gltf, gsply_files, page_file, page_look, sog, splat, usd
-from vvgt_cli.gaussians.formats.levels import StreamedLevels, split_name
 from vvgt_cli.gaussians.formats.nodes import Node
 from vvgt_cli.gaussians.formats.page_values import Values
 from vvgt_cli.gaussians.formats.splats import Splats, columns_of, gaussians_of, splats_of
+from vvgt_cli.gaussians.formats.streamed import StreamedLevels, split_name
 from vvgt_cli.gaussians.header import parse_header
 from vvgt_cli.gaussians.ply import check_size
 from vvgt_cli.volume.blocks import check_memory
@@ -130,7 +130,7 @@ def is_splats(path: str | Path) -> bool:
 def read_splats(path: str | Path) -> tuple[Gaussians, PlyHeader]:
     """Read a file of Gaussians of any format, in the frame of the file, with a header that has its comments.
 
-    For streamed levels, the name selects a level (`vvgt_cli.gaussians.formats.levels`).
+    For streamed levels, the name selects a level (`vvgt_cli.gaussians.formats.streamed`).
 
     Raises:
         UsageError: there is no such level.

@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.gaussians.formats.splats import HARMONICS, ROW_BYTES, Splats, morton_order
+from vvgt_cli.gaussians.formats.splats import ROW_BYTES, Splats, morton_order
 from vvgt_cli.gaussians.header import MIP, TYPES, header_lines
+from vvgt_cli.gaussians.types import HARMONICS
 from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.libraries import library_errors, need
 

@@ -1,7 +1,8 @@
 """The HTML page that shows Gaussians, and its single-file form, which opens without a server.
 
 `page/` holds the template and `viewer.js.gz`, which `make page` builds from `page.mjs`, SuperSplat's viewer and the
-PlayCanvas engine (CONTRIBUTING.md, "Dependencies").
+PlayCanvas engine (CONTRIBUTING.md, "Dependencies"). Frames of a series are stored whole, or as differences from the
+last whole one (`page/patch.mjs`).
 """
 
 from __future__ import annotations
@@ -11,30 +12,26 @@ import gzip
 import hashlib
 import json
 import re
+import struct
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from html import escape
 from importlib.resources import files
 from itertools import product
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import PlyOptions
-from vvgt_cli.gaussians.formats.gsply_files import read_compressed_ply
-from vvgt_cli.gaussians.formats.page_frames import stored_frames
-from vvgt_cli.gaussians.formats.splats import Splats
+from vvgt_cli.gaussians.formats.gsply_files import compressed_ply, read_compressed_ply
+from vvgt_cli.gaussians.formats.splats import Splats, morton_order
 from vvgt_cli.gaussians.frames import up_matrix
 from vvgt_cli.gaussians.header import facts_in
 from vvgt_cli.gaussians.rules import INRIA, RULES
 
 PROGRAM = "viewer.js.gz"
-_RULE = re.compile(r"vvgt size \d+ rule (\w+)$")
-_UNIT = re.compile(r"vvgt frame unit\b")
-_PLACED = re.compile(r"vvgt (frame|up|space|camera) ")
-_TITLE = re.compile(r"vvgt title (\".*\")$")
 _SPLATS = re.compile(rb'<script type="application/octet-stream" id="splats-\d+">([A-Za-z0-9+/=]+)</script>')
 _SCRIPTS, _STYLES = re.compile("<script>(.*?)</script>", re.S), re.compile("<style>(.*?)</style>", re.S)
 _FAR = 99  # percentile of distances from the middle that counts as the radius of a cloud
@@ -83,20 +80,20 @@ def camera(splats: Splats) -> dict[str, Any]:
         position and target in the viewer's axes, where PLY (x, y, z) is (-x, -y, z); the field of view in degrees, of
         the shorter side of the window.
     """
+    facts = facts_in(list(splats.comments), "page")
     if stated := asked(splats):
         return stated
     middle, half = np.zeros(3), 1.0
-    if not any(_UNIT.match(line) for line in splats.comments):
+    if facts.get("frame") != "unit":
         middle = np.median(splats.means, axis=0).astype(np.float64)
         half = float(np.percentile(np.linalg.norm(splats.means - middle, axis=1), _FAR)) or 1.0
-    target, towards = middle * VIEWER, _face(splats.comments) or _largest_side(splats)
+    target, towards = middle * VIEWER, _face(facts) or _largest_side(splats)
     eye = target + _DISTANCE * half * np.array(towards) / np.linalg.norm(towards)
     return {"position": eye.tolist(), "target": target.tolist(), "fov": _FIELD}
 
 
-def _face(comments: Sequence[str]) -> tuple[float, float, float] | None:
+def _face(facts: Mapping[str, Any]) -> tuple[float, float, float] | None:
     """Return the direction from a body to an eye that sees its face, in the viewer's axes; None of other files."""
-    facts = facts_in([line for line in comments if _PLACED.match(line)], "page")
     front = {"RAS": 1, "LPS": -1}.get(facts.get("space") or "")
     if front is None:
         return None
@@ -122,10 +119,8 @@ def _largest_side(splats: Splats) -> tuple[float, float, float]:
 
 def asked(splats: Splats) -> dict[str, Any] | None:
     """Return the camera that the file states, as `camera` does."""
-    if not any(line.startswith("vvgt camera ") for line in splats.comments):
-        return None
-    facts = facts_in([line for line in splats.comments if _PLACED.match(line)], "page")
-    if "scale" not in facts:
+    facts = facts_in(list(splats.comments), "page")
+    if "camera" not in facts or "scale" not in facts:
         return None
     *places, field = facts["camera"]
     points = np.reshape(places, (2, 3))
@@ -168,8 +163,7 @@ def _visible(clouds: Sequence[Splats]) -> np.ndarray:
 
 def rule_parameters(splats: Splats) -> dict[str, Any]:
     """Return the viewer's parameters for the rendering rule that the file names, or for the default one."""
-    matches = (_RULE.match(line) for line in splats.comments)
-    rule = RULES.get(next((match[1] for match in matches if match), ""), INRIA)
+    rule = RULES.get(facts_in(list(splats.comments), "page").get("rule", ""), INRIA)
     return {
         "dilation": rule.dilation, "compensate": rule.compensate, "shifted": rule.shifted,
         "reach": min(rule.reach, ENGINE_REACH),
@@ -276,9 +270,8 @@ def iframe(content: bytes, name: str) -> str:
 
 def title_of(name: str, comments: Iterable[str] = ()) -> str:
     """Return the title that a file states, else its name without folder and ending."""
-    for match in filter(None, map(_TITLE.match, comments)):
-        return str(json.loads(match[1]))
-    return re.split(r"[/\\]", name)[-1].removesuffix(".html")
+    stated: str | None = facts_in(list(comments), name).get("title")
+    return re.split(r"[/\\]", name)[-1].removesuffix(".html") if stated is None else stated
 
 
 def read_html(content: bytes, name: str) -> Splats:
@@ -293,3 +286,69 @@ def read_html(content: bytes, name: str) -> Splats:
     if len(clouds) > 1:
         raise DataError(f"{name}: a page of {len(clouds)} clouds of Gaussians; expected one: try the .ply of one cloud")
     return read_compressed_ply(base64.b64decode(clouds[0]), name)
+
+
+LEAST = 0.2  # smallest share of rows in common with the whole frame
+GAP = 16  # equal bytes that are kept within a run, as a new run costs 8 bytes
+
+
+class StoredFrame(NamedTuple):
+    """A frame stored in a page: a `.compressed.ply`, or the difference from that of frame ``whole``."""
+
+    content: bytes
+    whole: int | None
+
+
+def stored_frames(clouds: Sequence[tuple[str, Splats]]) -> list[StoredFrame]:
+    """Return all frames (name, columns), those that share rows with the last whole frame as differences."""
+    clouds, stored = _of_one_length(clouds), list[StoredFrame]()
+    while len(stored) < len(clouds):
+        first = len(stored)
+        key = clouds[first][1]
+        changed = [_changed(key, splats) for _, splats in clouds[first + 1 :]]
+        count = next((k for k, rows in enumerate(changed) if rows is None), len(changed))
+        ever = np.any([rows for rows in changed[:count] if rows is not None], axis=0) if count else None
+        order = None if ever is None else morton_order(key.means)
+        if order is not None and ever is not None:
+            order = order[np.argsort(ever[order], kind="stable")]  # unchanged Gaussians first
+        name, splats = clouds[first]
+        base = compressed_ply(splats, name, order)
+        stored.append(StoredFrame(base, None))
+        for name, splats in clouds[first + 1 : first + 1 + count]:
+            stored.append(StoredFrame(patch(base, compressed_ply(splats, name, order)), first))
+    return stored
+
+
+def _of_one_length(clouds: Sequence[tuple[str, Splats]]) -> list[tuple[str, Splats]]:
+    """Pad comments to the same length, because some, such as certificates, differ from frame to frame."""
+    sizes = [sum(len(f"comment {line}\n".encode()) for line in splats.comments) for _, splats in clouds]
+    if len(set(sizes)) < 2:
+        return list(clouds)
+    return [
+        (name, replace(splats, comments=(*splats.comments, " " * (max(sizes) - size))))
+        for (name, splats), size in zip(clouds, sizes, strict=True)
+    ]
+
+
+def _changed(key: Splats, splats: Splats) -> np.ndarray | None:
+    """Return a mask (K,) of the rows that differ, None if the frames have too little in common."""
+    if len(key) != len(splats) or key.f_rest.shape != splats.f_rest.shape:
+        return None
+    rows = np.zeros(len(key), bool)
+    for field in fields(Splats):
+        a, b = getattr(key, field.name), getattr(splats, field.name)
+        if isinstance(a, np.ndarray):
+            rows |= (a != b).reshape(len(rows), -1).any(axis=1)
+    return rows if rows.mean() <= 1 - LEAST else None
+
+
+def patch(base: bytes, content: bytes) -> bytes:
+    """Return the difference of ``content`` from ``base`` of the same length: runs, each (place, length, bytes)."""
+    a, b = np.frombuffer(base, np.uint8), np.frombuffer(content, np.uint8)
+    at = np.flatnonzero(a != b)
+    if not len(at):
+        return b""
+    breaks = np.flatnonzero(np.diff(at) > GAP)
+    first, last = at[np.concatenate([[0], breaks + 1])], at[np.concatenate([breaks, [len(at) - 1]])] + 1
+    runs = zip(first.tolist(), last.tolist(), strict=True)
+    return b"".join(struct.pack("<II", i, j - i) + content[i:j] for i, j in runs)

@@ -12,13 +12,14 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians, PlyOptions
-from vvgt_cli.gaussians.formats.page_file import html_of_several, title_of, upright
+from vvgt_cli.gaussians.formats.page_file import VIEWER, html_of_several, title_of, upright
 from vvgt_cli.gaussians.formats.page_presets import function_nodes, told
 from vvgt_cli.gaussians.formats.page_values import Values
 from vvgt_cli.gaussians.formats.splats import Splats, splats_of
 from vvgt_cli.gaussians.frames import up_matrix
 from vvgt_cli.gaussians.live_facts import LiveFacts
-from vvgt_cli.look.lighting import MATTE, MAX_LIGHT, Lighting
+from vvgt_cli.gaussians.story import LIGHT, OF_LIGHT, fields
+from vvgt_cli.look.lighting import MATTE, Lighting
 from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.look.readers.names import names
 from vvgt_cli.volume.components import listed
@@ -27,7 +28,6 @@ from vvgt_cli.volume.types import triple
 PLY = PlyOptions()
 SAMPLED = 96  # nodes for colours that are not interpolated linearly in RGB
 _RAMP = {"points": [{"x": 0, "rgb": [1, 1, 1], "opacity": 0}, {"x": 1, "rgb": [1, 1, 1], "opacity": 0.1}]}
-_HALF_TURN = np.diag([-1.0, -1.0, 1.0])  # the viewer shows PLY (x, y, z) at (-x, -y, z)
 
 
 def contents(options: PlyOptions, name: str, names: Sequence[str] = (), values: Values | None = None) -> str:
@@ -142,27 +142,21 @@ def parse_light(sent: Any, options: PlyOptions) -> Lighting | None:
 
     Raise DataError or UsageError if it is not valid.
     """
-    numbers = ("ambient", "diffuse", "specular", "power")
-    if not isinstance(sent, dict) or sent.get("kind") not in ("none", "headlight", "direction"):
-        raise DataError("the page's light: expected an object of kind none, headlight or direction")
-    toward = sent.get("from")
-    if not isinstance(toward, list) or len(toward) != 3:
-        raise DataError("the page's light: expected from, three numbers")
-    if not all(
-        isinstance(x, int | float) and abs(x) <= MAX_LIGHT for x in (*toward, *map(sent.get, numbers))
-    ) or not any(toward):
-        raise DataError(f"the page's light: expected finite numbers for from, {', '.join(numbers)}")
+    parts, what = OF_LIGHT | {"power": LIGHT}, "the page's light"
+    fields(**parts)(sent, what)
+    if missing := [key for key in parts if key not in sent]:
+        raise DataError(f"{what}: no {missing[0]}; expected {', '.join(parts)}")
     if sent["kind"] == "none":
         return None
-    direction = _axes(upright(options).up) @ np.array(toward, np.float64)
+    direction = _axes(upright(options).up) @ np.array(sent["from"], np.float64)
     directions = () if sent["kind"] == "headlight" else (triple((direction / np.linalg.norm(direction)).tolist()),)
-    ambient, diffuse, specular, power = (float(sent[name]) for name in numbers)
+    ambient, diffuse, specular, power = (float(sent[name]) for name in ("ambient", "diffuse", "specular", "power"))
     return Lighting(sent["kind"] == "headlight", directions, ambient, diffuse, specular, power)
 
 
 def _axes(up: str) -> np.ndarray:
     """Return the axes of the unit frame in the viewer's frame, as rows."""
-    axes: np.ndarray = (_HALF_TURN @ up_matrix(up)).T
+    axes: np.ndarray = (np.diag(VIEWER) @ up_matrix(up)).T
     return axes
 
 

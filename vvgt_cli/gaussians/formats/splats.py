@@ -13,8 +13,8 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, as_ply, read_ply
 from vvgt_cli.gaussians.header import parse_header
 from vvgt_cli.gaussians.ply import property_names
+from vvgt_cli.gaussians.types import HARMONICS
 
-HARMONICS = {0: 0, 1: 3, 2: 8, 3: 15}  # coefficients per channel above degree 0
 ROW_BYTES = 400  # memory that reading a Gaussian takes
 COLUMNS = ("means", "log_scales", "quaternions", "logits", "f_dc", "f_rest")
 DEGREES = {count: degree for degree, count in HARMONICS.items()}
