@@ -11,7 +11,7 @@ from vvgt_cli.dvr import RenderSettings, Scene, render_view
 from vvgt_cli.dvr.layout import BRICK, Voxels
 from vvgt_cli.dvr.runs import sample_run, stack_run
 from vvgt_cli.dvr.scene import kernel_type, kernel_values
-from vvgt_cli.look.tables import FLAT, MAX_OPACITY, build_tables, extinction
+from vvgt_cli.look.tables import EVEN, FLAT, MAX_OPACITY, build_tables, extinction
 from vvgt_cli.volume import Volume
 
 TYPES = ["b1", "u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f2", "f4", "f8"]
@@ -186,11 +186,13 @@ def test_spans_are_flat_up_to_a_difference_of_extinction_or_colour():
 
     for voxel in (2.0, 8.0, 32.0):
         tables = build_tables(Bumps(0, 10), (0, 10), unit_distance=1, world_per_unit=1, bins=80, voxel=voxel)
-        ends = []
-        for first in range(81):
-            spans = [np.ptp(tables.nodes[first : last + 1], axis=0).max() for last in range(first, 81)]
-            ends.append(first + sum(span * voxel <= FLAT for span in spans) - 1)
-        assert tables.flat.tolist() == ends
+        for most, until in ((FLAT, tables.flat), (EVEN, tables.even)):
+            ends = []
+            for first in range(81):
+                spans = [np.ptp(tables.nodes[first : last + 1], axis=0).max() for last in range(first, 81)]
+                end = first + sum(span * voxel <= most for span in spans) - 1
+                ends.append(end if end < 80 else np.inf)  # beyond the table, extinction is what it is at its end
+            assert until.tolist() == ends
         assert len(set(ends)) > 3
 
 

@@ -84,7 +84,7 @@ def cast(
             if light is None:
                 seen = add(seen, own)
             elif lane(own, 3) > 0.0:
-                r, g, b = shade_segment(own, light, voxels.values, p, d, look, s, dt)
+                r, g, b = shade_segment(own, light, voxels.values, p, d, look, s, t - dt, dt)
                 red, green, blue = red + r, green + g, blue + b
         before, u0 = u0, u1
         i += 1

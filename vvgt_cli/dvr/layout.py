@@ -115,7 +115,7 @@ class Light(NamedTuple):
 
 
 # Types of the fields, for `jit.decorators.kernel`.
-TUPLES: dict[type, str] = {Voxels: "V", Optics: "f8 f8 f8:2 f8:2 f8:1 f8:1"}
+TUPLES: dict[type, str] = {Voxels: "V", Optics: "f8 f8 f8:2 f8:2 f8:1 f8:1 f8:1"}
 EXTINCTION: dict[type, str] = {**TUPLES, Voxels: "E"}
 LIT: dict[type, str] = {**TUPLES, Light: "f8 f8 f8 f8 i8 f8:2 f4:4 i8 f8 f8:1 f8:1"}
 GRID: dict[type, str] = {Texels: "f4:4"}

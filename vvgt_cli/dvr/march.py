@@ -52,18 +52,18 @@ _exact = inlined(error_model="numpy", borrowed=True)  # the same on both sides o
 
 @_jit
 def shade_segment(
-    own: Quad, light: Light, values: np.ndarray, p: Vector, d: Vector, look: Vector, s: float, dt: float
+    own: Quad, light: Light, values: np.ndarray, p: Vector, d: Vector, look: Vector, s: float, t: float, dt: float
 ) -> tuple[float, float, float]:
     """Shade a segment's ``own`` (r, g, b, alpha), seen along ``look``; no colour exceeds its alpha.
 
-    It is of length dt and absorbs, on average, at p + s d: light is taken there, or as the mean of a quarter of dt
-    before and behind, where the segment shows more than `SHADED_TWICE`.
+    It goes from t to t + dt and absorbs, on average, at p + s d: light is taken there, or as the mean of a quarter of
+    dt before and behind, where the segment shows more than `SHADED_TWICE`.
     """
     most = lane(own, 3)
     times, apart = (2, 0.5 * dt) if most > SHADED_TWICE else (1, 0.0)
     red = green = blue = 0.0
     for n in range(times):
-        at = s + (n - 0.5) * apart
+        at = min(max(s + (n - 0.5) * apart, t), t + dt)
         r, g, b, white = shading(
             values, light, p[0] + at * d[0], p[1] + at * d[1], p[2] + at * d[2], look[0], look[1], look[2]
         )  # fmt: skip
@@ -107,7 +107,7 @@ def _through_values(
                     else:
                         own, trans, s = pass_segment(voxels, optics, p, d, here, dt, u0, u1, met, zeros4(), trans)
                         if lane(own, 3) > 0.0:
-                            r, g, b_ = shade_segment(own, light, voxels.values, p, d, look, s, dt)
+                            r, g, b_ = shade_segment(own, light, voxels.values, p, d, look, s, here, dt)
                             red, green, blue = red + r, green + g, blue + b_
                     if trans < opaque:
                         break
@@ -150,7 +150,7 @@ def _through_texels(
                 seen, trans = blend_texels(a, b, dt, seen, trans)
             else:
                 own, trans = blend_texels(a, b, dt, zeros4(), trans)
-                r, g, b_ = shade_segment(own, light, voxels.values, p, d, look, t - 0.5 * dt, dt)
+                r, g, b_ = shade_segment(own, light, voxels.values, p, d, look, t - 0.5 * dt, t - dt, dt)
                 red, green, blue = red + r, green + g, blue + b_
         a, known = b, True
         i += 1

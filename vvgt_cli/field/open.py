@@ -41,7 +41,7 @@ from vvgt_cli.volume.stored import Stored, is_file_backed, planes
 if TYPE_CHECKING:
     from vvgt_cli.field.cells import Reader
 
-LAYOUT = 7  # version of the stored blocks: increase it whenever their content changes
+LAYOUT = 8  # version of the stored blocks: increase it whenever their content changes
 MIN_BLOCKED = 1 << 30  # bytes of values: more are processed in blocks, with a tenth of the memory (docs/log/blocks.md)
 LARGE = 0.25  # share of the free memory: smaller files are always read whole
 PROGRAM, CELL_BYTES = 3e8, 300  # bytes: interpreter, libraries and kernels; a base cell in memory

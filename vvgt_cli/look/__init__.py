@@ -10,7 +10,6 @@ from vvgt_cli.look.labels import (
     check_labels,
     hex_color,
     labels_legend,
-    merge_labels,
 )
 from vvgt_cli.look.lighting import MATTE, MAX_LIGHT, NONE, Lighting, LightOptions, parse_lighting
 from vvgt_cli.look.readers import read_transfer_function
@@ -19,5 +18,5 @@ from vvgt_cli.look.show import draw
 
 __all__ = ["AUTO", "MATTE", "MAX_LIGHT", "NONE", "NO_LABELS", "PER_VOXEL", "ColorMap", "Label", "LabelTable"]
 __all__ += ["LightOptions", "Lighting", "Named", "PiecewiseOpacity", "TransferFunction", "TransferFunctionLike"]
-__all__ += ["check_labels", "check_visible", "draw", "from_histogram", "hex_color", "labels_legend", "merge_labels"]
+__all__ += ["check_labels", "check_visible", "draw", "from_histogram", "hex_color", "labels_legend"]
 __all__ += ["parse_lighting", "read_transfer_function", "resolve", "unit_distance"]

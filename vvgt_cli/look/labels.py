@@ -1,8 +1,7 @@
 """`LabelTable`: names, colours and opacities of a label map's labels; `label_files` reads its files.
 
 A name is cleaned by `clean_name`, and leaves in headers (`Label.comment`), legends (`labels_legend`), pages
-(`Label.page_entry`) and names of files (`Label.stem`). `merge_labels` joins the labels of several files; `parents_of`
-names the groups of a label.
+(`Label.page_entry`) and names of files (`Label.stem`). `parents_of` names the groups of a label.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 import warnings
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from itertools import pairwise
@@ -262,14 +261,6 @@ def labels_legend(labels: Sequence[Label], most: int) -> str:
 def hex_color(rgb: Sequence[float]) -> str:
     """Return a colour in [0, 1] as ``rrggbb``."""
     return "".join(f"{round(255 * min(max(float(c), 0.0), 1.0)):02x}" for c in rgb)
-
-
-def merge_labels(labels: Iterable[Label]) -> tuple[Label, ...]:
-    """Return the labels of several files by number, then name; each has the look that it has first."""
-    first: dict[tuple[int, str], Label] = {}
-    for label in labels:
-        first.setdefault(label.key, label)
-    return tuple(first[key] for key in sorted(first))
 
 
 Codes = tuple[tuple[str, str, str], ...]  # (part, "scheme:value", meaning) of each part that is there

@@ -73,6 +73,8 @@ class Optics(NamedTuple):
         positive = np.where(nodes[:, 3] > 0, np.arange(count), count + 1)
         dark = np.minimum.accumulate(positive[::-1])[::-1] - 1.0
         flat, even = (_flat_until(nodes, most / voxel) for most in (FLAT, EVEN))
+        for until in (flat, even):
+            until[until == count - 1] = np.inf
         return cls(lo, inv_width, nodes, cumulative, np.ascontiguousarray(dark), flat, even)
 
     @classmethod

@@ -221,7 +221,7 @@ def fields_backward(
     means = np.einsum("kij,kj->ki", rotations(g.quaternions), slopes[:, :3] / _scales(g))
     (w, x, y, z), (a, b, c) = g.quaternions.T.astype(np.float64), slopes[:, 6:9].T
     product = [-x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a]
-    turns = np.transpose(product) * (2 / (w * w + x * x + y * y + z * z))[:, None]
+    turns = np.transpose(product) * (2 / np.maximum(w * w + x * x + y * y + z * z, 1e-30))[:, None]
     parts = means, slopes[:, 3:6], turns, slopes[:, 9], slopes[:, 10:]
     out = Gradients(*(np.ascontiguousarray(part, np.float32) for part in parts))
     if g.harmonics is None:
