@@ -98,7 +98,7 @@ def test_views_are_channels_and_time_steps(tmp_path: Path, kind: str, stored: bo
         assert level_shapes(source, ReadOptions()) == [(6, 5, 4), (3, 3, 2)]
         refused(
             UsageError,
-            "--level 2: no such level; expected full",
+            "--level 2: expected full, or 0 to 1",
             read_volume,
             source,
             ReadOptions(time=0, component=0, level=2),

@@ -123,8 +123,8 @@ def test_netcdf_scaling_and_missing_values(tmp_path: Path) -> None:
     volume = read_volume(str(path), ReadOptions(array="unwritten"))
     assert np.isnan(volume.data[0]).all()
     np.testing.assert_allclose(volume.data[1:], VALUES[1:], rtol=1e-6)
-    refused(UsageError, r"several datasets: /holed \(3 x 4 x 5 int16\)", read_volume, str(path))
-    refused(UsageError, "no dataset 'none'; it has /holed", read_volume, str(path), ReadOptions(array="none"))
+    refused(UsageError, r"several variables: packed \(z, y, x: 3 x 4 x 5\); holed", read_volume, str(path))
+    refused(UsageError, "no variable 'none'; it has packed", read_volume, str(path), ReadOptions(array="none"))
 
 
 @pytest.mark.parametrize("kind", ["i1", "u1"])
@@ -317,10 +317,12 @@ def test_npy_lies(tmp_path: Path) -> None:
     refused(DataError, r"axes unnamed \(7\); expected two or three axes", read_volume, str(tmp_path / "w.npy"))
 
 
-@pytest.mark.parametrize(("name", "module"), [("v.nc", "h5py"), ("v.zarr", "zarr")])
+@pytest.mark.parametrize(("name", "module"), [("v.h5", "h5py"), ("v.nc", "netCDF4"), ("v.zarr", "zarr")])
 def test_a_missing_library_says_how_to_install_it(tmp_path, monkeypatch, name, module) -> None:
     if name == "v.zarr":
         zarr.create_array(str(tmp_path / name), data=VALUES)
+    elif name == "v.h5":
+        h5py.File(tmp_path / name, "w").create_dataset("field", data=VALUES).file.close()
     else:
         write_netcdf(tmp_path / name)
     monkeypatch.setitem(sys.modules, module, None)

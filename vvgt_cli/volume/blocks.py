@@ -12,7 +12,6 @@ import mmap
 import warnings
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import closing
 from pathlib import Path
 from typing import IO, Any
 
@@ -134,13 +133,11 @@ def load_block(
             f"{path.name}: {size_text(max(size - offset, 0))} of {encoding} data cannot hold the "
             f"{size_text(need + skip)} that its header declares; check the header's sizes and type"
         )
-    left: Any = Packed(path, dtype, shape, encoding, (offset, skip))
-    if not (packed and len(shape) == 3 and is_large(need)):
-        check_memory(need, path.name)
-        with closing(left):
-            left = left[:]
-    result: np.ndarray = left
-    return result
+    if packed and len(shape) == 3 and is_large(need):
+        left: Any = Packed(path, dtype, shape, encoding, (offset, skip))
+        result: np.ndarray = left
+        return result
+    return _decompressed(path, dtype, shape, offset, encoding, skip)
 
 
 def _too_short(path: Path, size: int, shape: tuple[int, ...], dtype: np.dtype, offset: int) -> DataError:
@@ -152,27 +149,52 @@ def _too_short(path: Path, size: int, shape: tuple[int, ...], dtype: np.dtype, o
     )
 
 
+def _decompressed(
+    path: Path, dtype: np.dtype, shape: tuple[int, ...], offset: int, encoding: str, skip: int
+) -> np.ndarray:
+    need = count(shape) * dtype.itemsize
+    check_memory(need, path.name)
+    with open(path, "rb") as file:
+        file.seek(offset)
+        try:
+            stream = _OPENERS[encoding](file)
+            _discard(stream, skip)
+            out, filled = fill(stream, need)
+            if filled == need:
+                stream.read(1)  # reaches the trailer, and with it the checksum
+        except (OSError, EOFError, zlib.error) as error:
+            raise _damaged(path, encoding, error) from error
+    if filled < need:
+        raise DataError(
+            f"{path.name}: its {encoding} data hold {size_text(filled + skip)}, its header declares "
+            f"{size_text(need + skip)}; check the header's sizes and type"
+        )
+    return out.view(dtype).reshape(shape)
+
+
 def _damaged(path: Path, encoding: str, error: Exception) -> DataError:
     return DataError(f"{path.name}: damaged {encoding} data ({error}); try to fetch the file again")
 
 
 class Packed:
-    """A compressed array that stays in its file: type, sizes, and slabs along its first axis, read front to back.
+    """A compressed array (nz, ny, nx) that stays in its file: type, sizes, and slabs of slices read front to back.
 
     Slabs that follow each other are decompressed once; an earlier one begins again at the file's start.
     """
 
+    ndim = 3
+
     def __init__(self, path: Path, dtype: np.dtype, shape: tuple[int, ...], encoding: str, start: tuple[int, int]):
         """Describe the block that `load_block` would read; ``start`` are its ``offset`` and ``skip``."""
         self.path, self.dtype, self.shape, self.encoding, self.start = path, dtype, shape, encoding, start
-        self.ndim, self.size = len(shape), count(shape)
+        self.size = count(shape)
         self.nbytes = self.size * dtype.itemsize
         self._file: IO[bytes] | None = None
         self._stream: Any = None
         self._next = 0  # slice
 
     def __getitem__(self, key: slice) -> np.ndarray:
-        """Read slices ``first:last``, (k, ...); raise DataError if the file ends early, or is damaged."""
+        """Read slices ``first:last``, (k, ny, nx); raise DataError if the file ends early, or is damaged."""
         first, last, _ = key.indices(self.shape[0])
         slice_bytes = count(self.shape[1:]) * self.dtype.itemsize
         need = (last - first) * slice_bytes
@@ -186,22 +208,16 @@ class Packed:
         except (OSError, EOFError, zlib.error) as error:
             raise _damaged(self.path, self.encoding, error) from error
         if filled < need:
-            held = size_text(first * slice_bytes + filled)
             raise DataError(
-                f"{self.path.name}: its {self.encoding} data hold {held}, its header declares "
-                f"{size_text(self.nbytes)}; check the header's sizes and type"
+                f"{self.path.name}: its {self.encoding} data end in slice {first + filled // slice_bytes} of "
+                f"{self.shape[0]}; check the header's sizes and type"
             )
         self._next = last
         return out.view(self.dtype).reshape(last - first, *self.shape[1:])
 
-    def close(self) -> None:
-        """Close the file; slices open it again."""
+    def _open(self) -> None:
         if self._file is not None:
             self._file.close()
-        self._file = self._stream = None
-
-    def _open(self) -> None:
-        self.close()
         self._file = open(self.path, "rb")  # noqa: SIM115 - as long as the volume lives
         self._file.seek(self.start[0])
         self._stream, self._next = _OPENERS[self.encoding](self._file), 0

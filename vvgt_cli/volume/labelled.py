@@ -29,10 +29,6 @@ CF_ATTRIBUTES = (
     *("valid_min", "valid_max", "valid_range", "_Unsigned"),
 )
 DESCRIBES = ("bounds", "climatology", "cell_measures", "formula_terms", "ancillary_variables", "grid_mapping")
-FILLS = {  # of NetCDF, by type: what unwritten values have where no attribute says otherwise (netcdf.h, NC_FILL_)
-    "i2": -32767, "i4": -2147483647, "i8": -9223372036854775806, "u2": 65535, "u4": 4294967295,
-    "u8": 18446744073709551614, "f4": 9.969209968386869e36, "f8": 9.969209968386869e36,
-}  # fmt: skip
 GEOMETRY = (  # attributes that look like a place in space, in forms that no convention defines
     *("spacing", "voxel_size", "voxelSize", "pixel_size", "pixelSize", "resolution", "origin", "offset", "affine"),
     *("direction", "transform"),

@@ -85,33 +85,6 @@ def with_neighbours(
     return axes
 
 
-def check_places(
-    dims: Sequence[str], others: Mapping[str, Sequence[str]], attributes: Mapping[str, Any],
-    beside: Mapping[str, Neighbour], source: str,
-) -> None:  # fmt: skip
-    """Warn of an array's places along several axes at once (CF, 5.2), which are not read.
-
-    ``dims`` are the names of its axes, ``others`` those of all arrays.
-
-    Raises:
-        DataError: x and y change along one axis together: cells of a mesh, stations or a path (CF, 9).
-    """
-    stated = text_of(attributes.get("coordinates", "")).split()
-    odd = [name for name in stated if len(set(others.get(name, ())) & set(dims)) > 1]
-    if odd:
-        warnings.warn(
-            f"{source}: its places are curvilinear ({', '.join(odd)}), which is not read: voxels lie on an even grid "
-            "of its axes (cdo remapbil or Resample in ParaView makes a regular one)", stacklevel=3,
-        )  # fmt: skip
-    lines = {name: one for name, one in beside.items() if one.along and one.along in dims}
-    along = {axis(name, 1, None, one.read()[1]).role: one.along for name, one in lines.items()}
-    if "x" in along and along["x"] == along.get("y"):
-        raise DataError(
-            f"{source}: values of a mesh or at stations (x and y both lie along {along['x']}); expected a grid: "
-            "remap them first (cdo remapbil)"
-        )
-
-
 def _numbered(axes: Sequence[Axis], beside: Mapping[str, Neighbour]) -> list[Axis] | None:
     """Return axes with coordinates whose names count the axes from 0 or 1; None unless all are there and ascend."""
     matches = {int(m[1]): one for name, one in beside.items() if (m := _NUMBERED.fullmatch(name))}

@@ -7,7 +7,6 @@ are applied.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,14 +15,13 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.arrays import MAX_CHUNK
-from vvgt_cli.volume.arrays.beside import GROUPS, Neighbour, check_places, choose_grid, with_neighbours
+from vvgt_cli.volume.arrays.beside import GROUPS, Neighbour, choose_grid, with_neighbours
 from vvgt_cli.volume.arrays.conventions import conventional_axes, coordinates_of
 from vvgt_cli.volume.blocks import data_file, load_block, size_text
 from vvgt_cli.volume.labelled import (
     CF_ATTRIBUTES,
     DESCRIBES,
     GEOMETRY,
-    MARKS,
     NAMING,
     Axis,
     axis,
@@ -52,8 +50,8 @@ def read_hdf5(path: Path, options: ReadOptions) -> Volume:
     return read_dataset(path, options)
 
 
-def read_dataset(path: Path, options: ReadOptions, fills: Mapping[str, float] | None = None) -> Volume:
-    """Read one dataset of an HDF5 file, as it is; ``fills`` are values that are missing, by type."""
+def read_dataset(path: Path, options: ReadOptions) -> Volume:
+    """Read one dataset of an HDF5 file, as it is."""
     h5py = need("h5py", "hdf5", str(path), "HDF5")
     with h5py.File(path, "r") as file:
         dataset = _choose(h5py, file, options.array, path)
@@ -64,18 +62,13 @@ def read_dataset(path: Path, options: ReadOptions, fills: Mapping[str, float] | 
         name = f"{volume_name(path)}:{dataset.name.strip('/')}"
         attributes = {key: dataset.attrs[key] for key in (*CF_ATTRIBUTES, *GEOMETRY, *NAMING) if key in dataset.attrs}
         attributes |= {key: up.attrs[key] for up in (file, dataset.parent) for key in GEOMETRY if key in up.attrs}
-        if (fill := (fills or {}).get(dataset.dtype.str[1:])) is not None:
-            attributes = {"_FillValue": fill} | attributes
         axes = scaled_axes(dataset)
         if not any(a.name or a.centres is not None for a in axes):
             axes, more = conventional_axes(file, dataset, source) or (axes, {})
             attributes |= more
-        beside = _beside(h5py, dataset, path)
-        stated = {"coordinates": dataset.attrs.get("coordinates", "")}
-        check_places(_dims(dataset), _coordinates(h5py, dataset), stated, beside, source)
-        axes = with_neighbours(axes, beside, source, options.spacing is not None)
-        chunks = dataset.chunks or (*[1] * (len(dataset.shape) - 2), *dataset.shape[-2:])
-        if options.stored and (mapped is None or any(key in attributes for key in MARKS)):
+        axes = with_neighbours(axes, _beside(h5py, dataset, path), source, options.spacing is not None)
+        chunks = dataset.chunks or dataset.shape
+        if mapped is None and options.stored:
             stored = partial(read_part, path, dataset.name)
         return labelled_volume(stored, dataset.dtype, axes, attributes, options, source, name, chunks)
 
@@ -123,7 +116,7 @@ def datasets(h5py: Any, group: Any) -> list[Any]:
 
 def _beside(h5py: Any, dataset: Any, path: Path) -> dict[str, Neighbour]:
     """List the datasets in the group of another, and in groups of coordinates beside that or above."""
-    here, neighbours, dims = dataset.parent, {}, _dims(dataset)
+    here, neighbours = dataset.parent, {}
 
     def read(item: Any) -> tuple[np.ndarray, dict[str, Any]]:
         check_storage(h5py, item, path, f"{path}:{printable(item.name)}")
@@ -134,10 +127,7 @@ def _beside(h5py: Any, dataset: Any, path: Path) -> dict[str, Neighbour]:
         coordinates = GROUPS.fullmatch(group.name.rpartition("/")[2]) and group.parent in (here, here.parent)
         near = isinstance(item, h5py.Dataset) and item != dataset and (group == here or coordinates)
         if near and not _is_bare(item):
-            along = next((own for own in _dims(item) if own in dims and len(item.shape) == 1), "")
-            neighbours[item.name.removeprefix(here.name).strip("/")] = Neighbour.of(
-                item.shape, partial(read, item), along
-            )
+            neighbours[item.name.removeprefix(here.name).strip("/")] = Neighbour.of(item.shape, partial(read, item))
         return True if len(neighbours) >= MAX_BESIDE else None
 
     here.parent.visititems(visit)
@@ -198,20 +188,6 @@ def scaled_axes(dataset: Any) -> list[Axis]:
         scale = scales[0]
         axes.append(axis(scale.name.rpartition("/")[2], size, *(() if _is_bare(scale) else coordinates_of(scale))))
     return axes
-
-
-def _coordinates(h5py: Any, dataset: Any) -> dict[str, list[str]]:
-    """Return the names of the axes of a dataset's coordinates in its group, by their names (CF, 5)."""
-    group, names = dataset.parent, text_of(dataset.attrs.get("coordinates", "")).split()
-    here = [name for name in names if isinstance(group.get(name, getlink=True), h5py.HardLink)]
-    return {name: _dims(group[name]) for name in here if isinstance(group[name], h5py.Dataset)}
-
-
-def _dims(dataset: Any) -> list[str]:
-    """Return the names of a dataset's axes by its dimension scales, or of one that is a scale; "" for none."""
-    scales = [next(iter(dimension.values()), None) for dimension in dataset.dims]
-    own = dataset.name if dataset.is_scale else ""
-    return [(own if scale is None else scale.name).rpartition("/")[2] for scale in scales]
 
 
 def _is_bare(scale: Any) -> bool:

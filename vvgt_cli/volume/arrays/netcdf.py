@@ -1,6 +1,7 @@
-"""NetCDF 3 and 4 (``.nc``), one variable on its CF axes: classic files mapped, version 4 read as the HDF5 that it is.
+"""NetCDF 3 and 4 (``.nc``), one variable on its CF axes. Read by netCDF4.
 
-The header of a classic file is compared with the file. Format: "NetCDF Classic Format Specification"
+The header of a classic file is walked and compared with the file before the library sees it: the C library follows
+counts and offsets of a damaged header out of its memory. Format: "NetCDF Classic Format Specification"
 (https://docs.unidata.ucar.edu/netcdf-c/current/file_format_specifications.html), CDF-1, -2 and -5.
 """
 
@@ -8,17 +9,21 @@ from __future__ import annotations
 
 import math
 import mmap
+import warnings
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.arrays.beside import Neighbour, check_places, choose_grid, with_neighbours
-from vvgt_cli.volume.arrays.hdf5 import read_dataset
-from vvgt_cli.volume.labelled import FILLS, axis, described_by, labelled_volume
-from vvgt_cli.volume.reading import ReadOptions, Volume, load_block, volume_name
+from vvgt_cli.volume.arrays.beside import Neighbour, choose_grid, with_neighbours
+from vvgt_cli.volume.labelled import DESCRIBES, axis, described_by, labelled_volume
+from vvgt_cli.volume.reading import ReadOptions, Volume, load_block, need, volume_name
+
+_TURN = Lock()  # the library is not for several threads
 
 
 def read_netcdf(path: Path, options: ReadOptions) -> Volume:
@@ -26,39 +31,108 @@ def read_netcdf(path: Path, options: ReadOptions) -> Volume:
 
     With ``options.stored`` its values stay in the file, and are read box by box.
     """
-    if options.dims is not None or options.component == "magnitude":  # which are computed as a whole
-        options = replace(options, stored=False)
+    library = need("netCDF4", "netcdf", str(path), "NetCDF")
     with open(path, "rb") as stream:
-        if stream.read(3) != b"CDF":
-            return read_dataset(path, options, FILLS)
-    variables = check_header(path)
-    name = _choose(variables, options.array, path)
-    one, source = variables[name], f"{path}:{name}"
-    fill = FILLS.get(one.dtype.str[1:])
-    attributes = ({} if fill is None else {"_FillValue": fill}) | one.attributes
-    axes = [axis(along, size) for along, size in zip(one.dims, one.shape, strict=True)]
-    lines = {key: v for key, v in variables.items() if len(v.dims) == 1 and v.dims[0] in one.dims}
-    beside = {
-        key: Neighbour.of(v.shape, lambda v=v: (v.mapped(path), v.attributes), *v.dims) for key, v in lines.items()
+        if stream.read(3) == b"CDF":
+            check_header(path)
+    with library.Dataset(str(path), "r") as file:
+        file.set_auto_maskandscale(False)
+        variable = _choose(file, options.array, path)
+        attributes = {key: variable.getncattr(key) for key in variable.ncattrs()}
+        kind = np.dtype(variable.dtype).str[1:]
+        if "_FillValue" not in attributes and kind[1:] != "1" and kind in library.default_fillvals:
+            attributes["_FillValue"] = library.default_fillvals[kind]  # what the library fills unwritten values with
+        source = f"{path}:{variable.name}"
+        axes = [axis(name, size) for name, size in zip(variable.dimensions, variable.shape, strict=True)]
+        _warn_of_curvilinear(variable, attributes, source)
+        beside = _beside(variable)
+        _refuse_mesh(beside, source)
+        axes = with_neighbours(axes, beside, source, options.spacing is not None)
+        name = f"{volume_name(path)}:{variable.name}"
+        where = f"{variable.group().path.rstrip('/')}/{variable.name}"
+        by_box = options.stored and options.dims is None and options.component != "magnitude"
+        read = partial(_part, path, where) if by_box else lambda index: variable[index]
+        chunks = _chunks(variable) if by_box else None
+        return labelled_volume(read, np.dtype(variable.dtype), axes, attributes, options, source, name, chunks)
+
+
+def _warn_of_curvilinear(variable: Any, attributes: dict[str, Any], source: str) -> None:
+    """Warn where places are coordinates of two or more axes (CF, 5.2), which are not read."""
+    names = str(attributes.get("coordinates", "")).split()
+    group = variable.group()
+    odd = [n for n in names if n in group.variables and len(set(group[n].dimensions) & set(variable.dimensions)) > 1]
+    if odd:
+        warnings.warn(
+            f"{source}: its places are curvilinear ({', '.join(odd)}), which is not read: voxels lie on an even grid "
+            "of its axes (cdo remapbil or Resample in ParaView makes a regular one)", stacklevel=2,
+        )  # fmt: skip
+
+
+def _beside(variable: Any) -> dict[str, Neighbour]:
+    """List the variables along one of a variable's dimensions, in its group and those above."""
+    groups = [variable.group()]
+    while groups[0].parent is not None:
+        groups.insert(0, groups[0].parent)
+    return {
+        name: Neighbour.of(one.shape, lambda one=one: (one[:], one.__dict__), *one.dimensions)
+        for group in groups
+        for name, one in group.variables.items()
+        if len(one.dimensions) == 1 and one.dimensions[0] in variable.dimensions
     }
-    check_places(one.dims, {key: v.dims for key, v in variables.items()}, attributes, beside, source)
-    axes = with_neighbours(axes, beside, source, options.spacing is not None)
-    values, chunks = one.mapped(path), [*[1] * (len(axes) - 2), *one.shape[-2:]]
-    stored = (lambda index: values[index]) if options.stored else values
-    named = f"{volume_name(path)}:{name}"
-    return labelled_volume(stored, one.dtype, axes, attributes, options, source, named, chunks)
 
 
-def _choose(variables: dict[str, Variable], wanted: str | None, path: Path) -> str:
+def _refuse_mesh(beside: dict[str, Neighbour], source: str) -> None:
+    """Raise DataError where x and y change along one axis together: cells of a mesh, stations or a path (CF, 9)."""
+    along = {axis(name, 1, None, one.read()[1]).role: one.along for name, one in beside.items()}
+    if "x" in along and along["x"] == along.get("y"):
+        raise DataError(
+            f"{source}: values of a mesh or at stations (x and y both lie along {along['x']}); expected a grid: "
+            "remap them first (cdo remapbil)"
+        )
+
+
+def _part(path: Path, where: str, index: tuple[Any, ...]) -> np.ndarray:
+    """Read a part of a variable from a file that is open no longer than that."""
+    import netCDF4
+
+    with _TURN, netCDF4.Dataset(str(path), "r") as file:
+        file.set_auto_maskandscale(False)
+        return np.asarray(file[where][index])
+
+
+def _chunks(variable: Any) -> list[int]:
+    """Return the values along each axis that the file packs together; a slice of plain values."""
+    sizes = variable.chunking()
+    if isinstance(sizes, list | tuple):
+        return [int(n) for n in sizes]
+    return [1] * (len(variable.shape) - 2) + list(variable.shape[-2:])
+
+
+def _choose(file: Any, wanted: str | None, path: Path) -> Any:
     """Return the variable asked for, else the only one of three axes or more (of two, if there is none)."""
-    described = {name for one in variables.values() for name in described_by(one.attributes)}
-    fits = {name: v for name, v in variables.items() if v.dtype.kind in "iuf" and name not in described}
+    variables: dict[str, Any] = {}
+    groups = [("", file)]
+    while groups:
+        prefix, group = groups.pop(0)
+        variables |= {prefix + name: variable for name, variable in group.variables.items()}
+        groups += [(f"{prefix}{name}/", inner) for name, inner in group.groups.items()]
+    described = {
+        name
+        for variable in variables.values()
+        for name in described_by({key: variable.getncattr(key) for key in DESCRIBES if key in variable.ncattrs()})
+    }
+    fits = {
+        name: variable
+        for name, variable in variables.items()
+        if isinstance(variable.dtype, np.dtype) and variable.dtype.kind in "iuf"
+        and name.rpartition("/")[2] not in described
+    }  # fmt: skip
     wanted = wanted and wanted.strip("/")
     if wanted in variables:
         fits = {wanted: variables[wanted]}
-    rows = {name: f"{name} ({', '.join(v.dims)}: {' x '.join(map(str, v.shape))})" for name, v in fits.items()}
-    grids = {name: (v.shape, v.dtype.name) for name, v in fits.items()}
-    return choose_grid(grids, wanted, str(path), "variable", rows=rows)
+    rows = {name: f"{name} ({', '.join(v.dimensions)}: {' x '.join(map(str, v.shape))})" for name, v in fits.items()}
+    grids = {name: (v.shape, np.dtype(v.dtype).name) for name, v in fits.items()}
+    return fits[choose_grid(grids, wanted, str(path), "variable", rows=rows)]
 
 
 _DIMENSION, _VARIABLE, _ATTRIBUTE = 10, 11, 12
@@ -157,7 +231,7 @@ class _Header:
             self.skip(kind.itemsize * n)
             data = self.data[begin : begin + kind.itemsize * n]
             text = kind.kind == "S"
-            values[_plain(name)] = _plain(data) if text else np.frombuffer(data, kind).astype(kind.newbyteorder("="))
+            values[_plain(name)] = _plain(data) if text else np.frombuffer(data, kind)
         return values
 
 

@@ -9,6 +9,7 @@ import itertools
 import re
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -16,7 +17,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.errors import DataError, UsageError, VvgtError
 from vvgt_cli.volume.microscopy.image import MAX_XML, choose_channel, choose_image, safe_xml
 from vvgt_cli.volume.readers import lazy
 from vvgt_cli.volume.reading import ReadOptions, Volume, magnitude, need, printable
@@ -29,7 +30,7 @@ READ = {  # by the XML element that names the data: reader, and the array of tim
     "zarr": (lazy("arrays.zarr.read_zarr"), "s{s}-t{t}.zarr/{l}"),
 }
 VIEW = re.compile(r"/?(?:t(?P<t>\d+)/s(?P<s>\d+)/(?P<l>\d+)/cells|setup(?P<s5>\d+)/timepoint(?P<t5>\d+)/s(?P<l5>\d+))")
-MAX_TIMES = 1_000_000
+MAX_TIMES, MAX_LEVELS = 1_000_000, 64
 ALIKE = 1e-3  # relative difference up to which a registration has the proportions of the voxel sizes
 
 
@@ -82,6 +83,14 @@ class _Dataset:
                 "listed as missing; expected its values: export it again, or choose another --time or --channel"
             ) from error
         return volume
+
+    def levels(self, view: tuple[int, int]) -> list[tuple[int, ...]]:
+        """List the shapes (z, y, x) of the levels of a view."""
+        shapes: list[tuple[int, ...]] = []
+        with suppress(VvgtError):
+            while len(shapes) < MAX_LEVELS:
+                shapes.append(self.read(view, len(shapes)).data.shape)
+        return shapes
 
 
 def read_bdv(path: Path, options: ReadOptions) -> Volume:
@@ -161,11 +170,9 @@ def _read(bdv: _Dataset, options: ReadOptions) -> Volume:
 def _view(bdv: _Dataset, time: int, setup: _Setup, options: ReadOptions) -> Volume:
     """Read a view, left in its file, at the place that its registration gives it."""
     view, level = bdv.present(time, setup), options.level or 0
-    finest = bdv.read(view, 0)
-    try:
-        volume = bdv.read(view, level) if level else finest
-    except DataError as error:
-        raise UsageError(f"{bdv.source}: --level {level}: no such level; expected full, or a lower one") from error
+    if level and level >= (count := len(bdv.levels(view))):
+        raise UsageError(f"{bdv.source}: --level {level}: expected full, or 0 to {count - 1}")
+    finest, volume = bdv.read(view, 0), bdv.read(view, level)
     if len(setup.size) and [*finest.dims] != [*setup.size]:
         dims, stated = (" x ".join(f"{n:g}" for n in some) for some in (finest.dims, setup.size))
         raise DataError(
