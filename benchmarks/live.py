@@ -98,7 +98,7 @@ def measured_lit(name: str, field: Resident, gaussians: int) -> list[dict[str, A
     live, table, rows = placed(field, gaussians), function_table(field.source), []
     for title, lights in {"none": (), "headlight": ("headlight",), "0.3,-0.8,0.5": ("0.3,-0.8,0.5",)}.items():
         source = replace(field.source, lighting=LightOptions(lights).lighting(None, None) if lights else None)
-        lit = Resident.of(source)
+        lit = Resident(source)
         run = Run(Console(quiet=True), ConversionReport("init"))
         fit = FitOptions(max_gaussians=gaussians, screen=SIZE)
         work = Work(run, lit, fit, degree=degree_of(ConvertRequest(SourceRequest("-"), None, fit), source))
@@ -151,7 +151,7 @@ def main(
         return
     rows = []
     for name, source in read_scenes(*paths, names or None):  # type: ignore[misc]
-        field = Resident.of(source)
+        field = Resident(source)
         for count in gaussians:
             rows += measured_lit(name, field, count) if lit else measured(name, field, count, beside)
     write_rows(output, rows)

@@ -102,7 +102,7 @@ def main(
     if table:
         print_table(table)
         return
-    fields = ((name, Resident.of(source)) for name, source in read_scenes(*paths, names or None))
+    fields = ((name, Resident(source)) for name, source in read_scenes(*paths, names or None))
     write_rows(output, [measured(name, field, count) for name, field in fields for count in gaussians])
 
 

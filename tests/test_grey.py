@@ -126,7 +126,7 @@ def test_a_volumes_mip_is_its_twins(tmp_path: Path) -> None:
         best = np.maximum(best, np.where(k < count, value, 0))
     wanted = best.reshape(SIZE, SIZE, -1).mean(axis=2)
     assert 0.2 < wanted.mean() < 0.9
-    np.testing.assert_allclose(render.mip_of(Resident.of(source))(eye)[..., 0], wanted, atol=1e-4)
+    np.testing.assert_allclose(render.mip_of(Resident(source))(eye)[..., 0], wanted, atol=1e-4)
 
 
 def test_the_x_ray_of_a_uniform_volume_keeps_1_over_e_along_its_edge(tmp_path: Path) -> None:

@@ -170,7 +170,7 @@ def test_the_axis_of_normals_is_that_of_a_surface_and_shorter_the_noisier_it_is(
     found = {}
     for name, values in {"plate": plate, "ramp": z, "rough": z + 2 * noise, "noise": noise, "flat": 0 * noise}.items():
         volume = Volume(values.astype(np.float32), (1, 1, 1), name=name)
-        live = Resident.of(load(SourceRequest(volume, tf="viridis"))).sample(some)[0]
+        live = Resident(load(SourceRequest(volume, tf="viridis"))).sample(some)[0]
         found[name] = live[2:5], live[5:8]
     share = {name: float(np.linalg.norm(axis)) for name, (axis, _) in found.items()}
     assert share["ramp"] == pytest.approx(1, abs=1e-6)

@@ -142,7 +142,7 @@ def test_pixels_that_show_them():
 
 
 def test_pictures_of_the_next_frame_are_as_drawn_again(tmp_path):
-    first, second = (Resident.of(one) for one in sources(tmp_path, body(0.2), body(0.26)))
+    first, second = (Resident(one) for one in sources(tmp_path, body(0.2), body(0.26)))
     kept = RememberedViews(200, first)
     camera, how = default_views("test", 5, size=190)[3], RenderSettings(samples=1)
     kept.view(camera, how)

@@ -74,6 +74,17 @@ def test_a_run_that_is_killed_goes_on(vvgt, tmp_path, made, monkeypatch):
         assert (tmp_path / "v" / path.relative_to(made)).read_bytes() == path.read_bytes()
 
 
+def test_a_renderer_that_is_not_there_leaves_nothing(vvgt, tmp_path, monkeypatch):
+    from vvgt_cli.dvr import backends
+
+    def refuse(renderer, scene, settings):
+        raise DataError(f"no device for {renderer}")
+
+    monkeypatch.setattr(backends, "view_renderer", refuse)
+    assert "no device for vtk" in vvgt(*BASE, "--renderer", "vtk", "-o", tmp_path / "v").error
+    assert not (tmp_path / "v").exists()
+
+
 def test_views_that_see_nothing_leave_nothing(vvgt, tmp_path):
     tf = '{"points": [{"x": 0.9999, "opacity": 0}, {"x": 1, "opacity": 1e-9, "rgb": [1, 0, 0]}]}'
     (tmp_path / "tf.json").write_text(tf)

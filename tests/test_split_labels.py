@@ -161,7 +161,7 @@ def test_gaussians_near_no_label_are_told_by_colours_that_light_darkens() -> Non
 
 
 def hidden_of(source):
-    form = Resident(source, source.scene()).pyramid(VbmOptions(600, 64)).form
+    form = Resident(source).pyramid(VbmOptions(600, 64)).form
     return hidden_cells(form.seen.largest > HIDDEN, form.seen.edge, form.half, form.step)
 
 

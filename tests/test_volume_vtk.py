@@ -324,10 +324,10 @@ def test_tiff_lies(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert good.count(width) == 3
     cases = {
         good.replace(width, struct.pack("<HHII", 256, 4, 1, 6), 1): "2 series: 0 .*axes YX.*; 1 ",
-        good.replace(width, struct.pack("<HHII", 256, 4, 1, 2_000_000_000)): "of memory|are missing",
+        good.replace(width, struct.pack("<HHII", 256, 4, 1, 2_000_000_000)): "cannot hold",
         good[:-30]: "cut short",
-        good[:6]: "cannot be read as TIFF",
-        b"II*\0" + bytes(4): "no pages",
+        good[:6]: "cut short",
+        b"II*\0" + bytes(4): "without pages",
     }
     for body, message in cases.items():
         path.write_bytes(body)

@@ -227,10 +227,10 @@ values_option = click.option(
 )  # fmt: skip
 
 report_option = click.option(
-    "--report", metavar="R.json", help="Save times and errors of all stages as JSON; - is standard output."
+    "--report", metavar="R.json", help="Save stages, times and scores as JSON; - is standard output."
 )
 
-json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
+json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
 
 overwrite_option = click.option("--overwrite", is_flag=True, help="Overwrite existing files.")
 

@@ -43,7 +43,6 @@ from vvgt_cli.volume.types import IDENTITY
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import RenderSettings
-    from vvgt_cli.field.field import Field
 
 
 CONTACT = "contact.png"
@@ -395,6 +394,7 @@ def write_views(
             _work(run, one, rays)
             if isinstance(one.field, Blocked):
                 one.field.run_pass.store.remove()
+            vars(one.field).pop("scene", None)  # an optics grid takes 20 bytes a voxel
 
 
 def _settings(layout: Layout, rays: Rays, views: Sequence[View], source: StyledVolume, content: str) -> dict[str, Any]:

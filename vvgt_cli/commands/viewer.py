@@ -19,7 +19,7 @@ from vvgt_cli.commands.live_site import BYTES, HTML, JSON, SCRIPT, PageControlle
 from vvgt_cli.commands.server import Resource, Site, served
 from vvgt_cli.conversion.clouds import Cloud, Clouds, write_together
 from vvgt_cli.conversion.gaussian_files import STDIN, layout_of, open_gaussians, read_back, write_gaussians
-from vvgt_cli.conversion.index import FRAMES, named_files
+from vvgt_cli.conversion.index import FRAMES, is_pattern, named_files
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians, PlyOptions
@@ -114,6 +114,8 @@ def _join(
             f"-o {output}: got {len(files)} files; expected a page (.html), which holds several "
             "(one .glb, .usdc or .usdz of several labels is written by 'vvgt convert MAP --split-labels')"
         )
+    if is_pattern(output):
+        raise UsageError(f"-o {output}: one page shows all files; use a name without braces")
     with claimed([Output("-o", output, (".html",), splats=True)], files, overwrite):
         names = [name for name, _ in clouds]
         names = names if len(set(names)) == len(names) else files

@@ -69,7 +69,7 @@ def opened_upright(
     store: AbstractContextManager[BlockStore] | None = None, device: str = "cpu",
     look: Callable[[StyledVolume], StyledVolume] = lambda source: source,
 ) -> Iterator[Field]:  # fmt: skip
-    """Open a volume that pinhole cameras see; arguments and errors are those of `opened`.
+    """Open a volume that pinhole cameras see, laid out on first use; arguments and errors are those of `opened`.
 
     Raises:
         DataError: the volume is sheared.
@@ -84,7 +84,7 @@ def opened_upright(
             )
         return source.kernels(kernels)
 
-    with opened(run, request, blocks, needs, needed, store, device, look) as field:
+    with opened(run, request, blocks, needs, needed, store, device, look, at_once=False) as field:
         yield field
 
 

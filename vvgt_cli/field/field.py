@@ -104,23 +104,21 @@ class Resident(Field):
 
     Attributes:
         source: the volume and its look.
-        scene: the values, laid out for the kernels.
         renderer: renders its pictures; None selects the field itself.
         device: "cpu" or "cuda", which renders them where it is the field itself.
         report: gets a line if the device fails.
     """
 
     source: StyledVolume
-    scene: Scene
     renderer: ViewRenderer | None = None
     device: str = "cpu"
     report: Callable[[str], None] = print
     _drawn: dict[str, np.ndarray] = field(default_factory=dict)  # pixels of pictures' blocks, by `Picture.key`
 
-    @classmethod
-    def of(cls, source: StyledVolume, device: str = "cpu", report: Callable[[str], None] = print) -> Resident:
-        """Return the field of a source, with its values laid out for the kernels."""
-        return cls(source, on_device(source.scene(), device, report), device=device, report=report)
+    @cached_property
+    def scene(self) -> Scene:
+        """The volume under its look, laid out for the kernels: on first use, as a sky's light takes long."""
+        return on_device(self.source.scene(), self.device, self.report)
 
     @cached_property
     def layout(self) -> PreparedVolume:
@@ -188,4 +186,5 @@ class Resident(Field):
         if source.layers[0].volume is not self.source.layers[0].volume:
             source = replace(source, statistics=statistics(source.volume))
         gridded = source.gridded or self.source.gridded
-        return Resident.of(source if gridded else replace(source, layout=self.layout), self.device, self.report)
+        source = source if gridded else replace(source, layout=self.layout)
+        return Resident(source, device=self.device, report=self.report)

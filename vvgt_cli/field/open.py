@@ -153,7 +153,7 @@ def blocked(
 def opened(
     run: Run, request: SourceRequest, options: BlockOptions | None, needs: FieldNeeds,
     kernels: Callable[[StyledVolume, bool], tuple[str, ...]], store: AbstractContextManager[BlockStore] | None = None,
-    device: str = "cpu", look: Callable[[StyledVolume], StyledVolume] = lambda source: source,
+    device: str = "cpu", look: Callable[[StyledVolume], StyledVolume] = lambda source: source, at_once: bool = True,
 ) -> Iterator[Field]:  # fmt: skip
     """Open a volume under its look as a field, in memory, or in blocks if it is large.
 
@@ -166,6 +166,7 @@ def opened(
         store: provides the store of blocks; None for a temporary one.
         device: "cpu" or "cuda", which renders a volume in memory.
         look: changes the source before kernels are compiled.
+        at_once: lay a volume in memory out for the kernels, and trace its light, now, not on first use.
 
     Raises:
         DataError, UsageError: see `vvgt_cli.field.source.load`.
@@ -177,8 +178,10 @@ def opened(
             source = look(load(request))
             stage.note = describe_source(source)
         run.compile(kernels(source, False), source.kernel_type())
-        with run.stage("scene"):
-            field = Resident.of(source, device, run.console.message)
+        field = Resident(source, device=device, report=run.console.message)
+        if at_once:
+            with run.stage("scene"):
+                _ = field.scene
         yield field
         return
     with store or store_beside(None) as blocks, blocked(run, request, options, blocks, needs) as in_blocks:

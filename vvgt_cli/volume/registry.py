@@ -134,10 +134,10 @@ def level_shapes(source: str, options: ReadOptions) -> list[tuple[int, ...]]:
         holding = (r for r in READERS if r.levels and r.holds is not None and r.holds(path))
         reader = next(holding, None) if path.is_dir() else None
         if path.is_file():
-            reader = _recognised(path, _head(path, source))[0]
+            reader = _find(path, _head(path, source), options)
         if reader is None or not reader.levels:
             return []
-    first = ReadOptions(array=options.array, component=0, time=options.time or 0, stored=True)
+    first = ReadOptions(array=options.array, component=0, time=options.time or 0, spacing=options.spacing, stored=True)
     with suppress(VvgtError), warnings.catch_warnings():  # said where it is read
         warnings.simplefilter("ignore")
         while len(shapes) < MAX_LEVELS:

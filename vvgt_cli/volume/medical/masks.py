@@ -20,7 +20,7 @@ from vvgt_cli.volume.reading import ReadOptions, Segment, Volume, check_memory, 
 from vvgt_cli.volume.registry import read_volume
 from vvgt_cli.volume.stored import planes
 from vvgt_cli.volume.tiff import PICTURES, SUFFIXES
-from vvgt_cli.volume.tiff.ome import page_count
+from vvgt_cli.volume.tiff.pages import check_pages
 from vvgt_cli.volume.tiff.slices import by_number, matching
 
 VALUES = (".img", ".img.gz", ".brik", ".brik.gz")  # of a header that is beside them
@@ -31,7 +31,7 @@ def hold_volumes(files: Sequence[Path]) -> bool:
     if any(file.suffix.lower() not in SUFFIXES for file in files):
         return True
     try:
-        return bool(files) and page_count(files[0]) > 1
+        return bool(files) and check_pages(files[0]) > 1
     except (DataError, OSError):  # which is reported where it is read
         return False
 

@@ -5,14 +5,12 @@ Files name each other by name and UUID (OME model 2016-06, TiffData); the UUID s
 
 from __future__ import annotations
 
-import logging
 import math
 import re
 import struct
 import warnings
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -20,40 +18,12 @@ from xml.etree import ElementTree
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.components import listed
-from vvgt_cli.volume.headers import printable
-from vvgt_cli.volume.libraries import library_errors
 from vvgt_cli.volume.microscopy.image import MAX_XML, safe_xml
 from vvgt_cli.volume.tiff import TIFF
+from vvgt_cli.volume.tiff.pages import MAX_PAGES, check_pages
 
-MAX_PAGES = 1 << 20
 _MOST_FILES = 10_000
-_FAULTS = re.compile(r"corrupted tag list|invalid (?:offset to page|page offset|circular)|TiffTag.fromfile> raised")
 _UUID = re.compile(r"""<(?:\w+:)?OME\b[^>]*?\bUUID=["']([^"']+)""")
-
-
-@contextmanager
-def reported(path: Path) -> Iterator[None]:
-    """Keep tifffile from logging, but raise DataError for directories that it calls damaged, and would leave out."""
-    logger, handler, said = logging.getLogger("tifffile"), logging.Handler(logging.ERROR), list[str]()
-    handler.emit = lambda record: said.append(record.getMessage())  # type: ignore[method-assign]
-    before, logger.propagate = logger.propagate, False
-    logger.addHandler(handler)
-    try:
-        yield
-    finally:
-        logger.removeHandler(handler)
-        logger.propagate = before
-    if fault := next(filter(_FAULTS.search, said), None):
-        text = printable(" ".join(fault.split()))[:200]
-        raise DataError(f"{path}: its TIFF directories are damaged or cut short ({text}); check that the file is whole")
-
-
-def page_count(path: Path) -> int:
-    """Count the pages of a file; raise DataError if its directories are damaged."""
-    import tifffile
-
-    with library_errors(str(path), "TIFF"), reported(path), tifffile.TiffFile(path) as file:
-        return len(file.pages)
 
 
 def open_tiff(path: Path) -> Any:
@@ -103,7 +73,8 @@ def _description(path: Path) -> str:
 
     if not path.name.lower().endswith(TIFF):
         return path.read_bytes()[:MAX_XML].decode("utf-8-sig", "replace")
-    with reported(path), tifffile.TiffFile(path) as file:
+    check_pages(path)
+    with tifffile.TiffFile(path) as file:
         return str(file.ome_metadata or "")
 
 
@@ -138,7 +109,7 @@ def _name_files(root: ElementTree.Element, path: Path, uuid: str | None) -> None
         plane.set("FileName", file)
     root.set("UUID", path.name)
     for file in set(present.values()) - {path.name}:
-        page_count(path.with_name(file))
+        check_pages(path.with_name(file))
 
 
 def _uuids(folder: Path) -> dict[str, str]:

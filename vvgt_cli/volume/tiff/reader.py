@@ -11,10 +11,12 @@ Voxel sizes and names of channels follow OME-XML and ImageJ's description: OME m
 from __future__ import annotations
 
 import itertools
+import logging
 import math
 import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
@@ -28,7 +30,8 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.microscopy.image import Micrograph, choose_image, picture_volume
 from vvgt_cli.volume.reading import ReadOptions, Slices, Volume, metres, size_text, triple, volume_name
 from vvgt_cli.volume.tiff.decode import Pages
-from vvgt_cli.volume.tiff.ome import ome_tag, open_tiff, page_count, reported
+from vvgt_cli.volume.tiff.ome import ome_tag, open_tiff
+from vvgt_cli.volume.tiff.pages import check_pages
 
 _AXES = {"X": "columns", "Y": "rows", "Z": "slices", "T": "time steps", "C": "channels", "S": "samples"}
 
@@ -85,8 +88,8 @@ def read_tiff(path: Path, options: ReadOptions, slices: int = 1) -> Volume:
 
     A volume has so many ``slices`` if the file is one of them.
     """
-    page_count(path)
-    with reported(path), open_tiff(path) as file, Pages(path) as pages:
+    check_pages(path)
+    with _silent(), open_tiff(path) as file, Pages(path) as pages:
         root = ElementTree.fromstring(file.ome_metadata) if file.is_ome and file.ome_metadata else None
         count_planes(file)
         series, number = _series(file, options.array, path)
@@ -136,6 +139,17 @@ def _read(
             number = int(np.ravel_multi_index(place, lead)) if place else 0
             row[...] = pages.decoded(series[number], series).reshape(inner)[within]
     return layout.zyx(out)
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Keep tifffile from logging: what matters of it becomes an error here."""
+    logger = logging.getLogger("tifffile")
+    before, logger.disabled = logger.disabled, True
+    try:
+        yield
+    finally:
+        logger.disabled = before
 
 
 def _series(file: Any, wanted: str | None, path: Path) -> tuple[Any, int]:

@@ -325,7 +325,7 @@ def _reader(path: Path, kind: str | None, head: bytes) -> Any:
         if is_legacy(head, grid=True):
             check_legacy_grid(path)
         reader = vtkDataSetReader()
-        for what in ("Scalars", "Vectors", "Fields", "Tensors"):
+        for what in ("Scalars", "Vectors", "Normals", "Tensors", "ColorScalars", "TCoords", "Fields"):
             getattr(reader, f"ReadAll{what}On")()
         return reader
     raise DataError(f"{path}: no dataset of VTK's ({kind or head[:16]!r}); expected a file that an index may name")

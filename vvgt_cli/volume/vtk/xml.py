@@ -263,7 +263,9 @@ def image_values(header: Scan, info: ArrayInfo, grid: Grid, options: ReadOptions
     """
     row = header.find(info.name, info.where)
     form, compressor = row.attributes.get("format") if row else "", header.root.get("compressor", "")
-    whole = header.pieces == 1 and not any(header.find(GHOSTS, where) for where in HIDDEN)
+    ghosts = [ghost for where in HIDDEN if (ghost := header.find(GHOSTS, where)) is not None]
+    hidden = any(ghost.attributes.get("RangeMax") not in ("0", "1") for ghost in ghosts)  # 1: only duplicates
+    whole = header.pieces == 1 and not hidden
     if row is not None and whole and row.attributes["type"] != "Bit":
         appended = form == "appended" and header.data_start >= 0
         start = header.data_start + int(row.attributes.get("offset", "0"))
@@ -278,6 +280,8 @@ def image_values(header: Scan, info: ArrayInfo, grid: Grid, options: ReadOptions
             packed: np.ndarray = packed_array(header, info, grid, start, coded, options, path)
             return packed
     values: np.ndarray = IMAGE_BY_VTK(path, replace(options, array=info.name or None, spacing=None)).data
+    if values.shape != grid.dims[::-1]:
+        raise DataError(f"{path}: points and cells have an array {info.name!r} each; rename one of them")
     return values
 
 
