@@ -113,7 +113,7 @@ def test_the_closed_form_of_blocks_is_that_of_memory(tmp_path, light, method):
     options = VbmOptions(300, 64, method, degree=2 if source.lighting else 0)
     from vvgt_cli.field.field import Resident
 
-    memory = Resident(source, source.scene())
+    memory = Resident(source)
     ours = memory.pyramid(options).gaussians
     with in_blocks(request, 16, tmp_path / "parts") as field:
         theirs = field.pyramid(options).gaussians
