@@ -60,6 +60,10 @@ def test_values_have_the_name_and_unit_of_their_file(tmp_path: Path, name: str) 
         file["field"].setncatts({"units": "K", "long_name": "air temperature"})
     volume = read_volume(path)
     assert (volume.quantity, volume.values_in) == ("air temperature", "K")
+    with netCDF4.Dataset(path, "a") as file:
+        file["field"].setncatts({"units": "", "long_name": ""})  # in HDF5 an attribute without a value
+    volume = read_volume(path)
+    assert (volume.quantity, volume.values_in) == ("", "")
 
 
 def test_netcdf_descending_axes_are_turned(tmp_path: Path) -> None:

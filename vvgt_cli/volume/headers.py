@@ -128,6 +128,8 @@ def printable(text: str) -> str:
 
 
 def text_of(value: Any) -> str:
-    """Return an attribute as text, the first of several."""
+    """Return an attribute as text, the first of several; none for one of HDF5 that is empty."""
+    if getattr(value, "shape", ()) is None:  # h5py.Empty
+        return ""
     value = value if isinstance(value, str | bytes) else (np.asarray(value).reshape(-1).tolist() or [""])[0]
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)

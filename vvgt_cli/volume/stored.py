@@ -31,6 +31,7 @@ class Stored:
         shape: (nz, ny, nx).
         dtype: of the values.
         chunks: (z, y, x) voxels of what the file packs together.
+        in_file: they stay in a file; else parts that are in memory are laid out when they are read.
     """
 
     ndim = 3
@@ -42,8 +43,10 @@ class Stored:
         shape: tuple[int, ...],
         chunks: Sequence[int],
         source: str,
+        in_file: bool = True,
     ) -> None:
         """Take a function that reads three slices (z, y, x) with start, stop and step 1; ``source`` is for messages."""
+        self.in_file = in_file
         self._read, self.dtype, self.shape, self.source = read, np.dtype(dtype), tuple(map(int, shape)), source
         self.chunks = tuple(max(min(int(c), n), 1) for c, n in zip(chunks, self.shape, strict=True))
         self.size = math.prod(self.shape)
@@ -72,7 +75,7 @@ class Stored:
         def read(slices: Slices) -> np.ndarray:
             return self[tuple(slice(a + k.start, a + k.stop) for (a, _), k in zip(spans, slices, strict=True))]
 
-        return Stored(read, self.dtype, tuple(b - a for a, b in spans), self.chunks, self.source)
+        return Stored(read, self.dtype, tuple(b - a for a, b in spans), self.chunks, self.source, self.in_file)
 
     def _damaged(self, slices: Slices, error: Exception) -> DataError:
         """Make the error of the first chunk in the block that cannot be read."""
@@ -132,7 +135,7 @@ def chunks_of(volume: Volume) -> tuple[int, ...]:
 
 def is_file_backed(volume: Volume) -> bool:
     """Tell whether a volume's values lie in a file, mapped or `Stored`."""
-    return isinstance(volume.data, Stored) or _mapping_of(volume.data) is not None
+    return volume.data.in_file if isinstance(volume.data, Stored) else _mapping_of(volume.data) is not None
 
 
 def read_block(volume: Volume, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:

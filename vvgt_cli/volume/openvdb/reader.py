@@ -178,7 +178,7 @@ def brick_array(
         return out
 
     shape = tuple(int(b - a) + 1 for a, b in zip(lo[::-1], hi[::-1], strict=True))
-    return Stored(read, fill.dtype, shape, (EDGE, *shape[1:]), source)
+    return Stored(read, fill.dtype, shape, (EDGE, *shape[1:]), source, in_file=False)
 
 
 def laid_out(values: Stored) -> np.ndarray:
