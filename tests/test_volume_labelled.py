@@ -60,9 +60,14 @@ def test_values_have_the_name_and_unit_of_their_file(tmp_path: Path, name: str) 
         file["field"].setncatts({"units": "K", "long_name": "air temperature"})
     volume = read_volume(path)
     assert (volume.quantity, volume.values_in) == ("air temperature", "K")
-    with netCDF4.Dataset(path, "a") as file:
-        file["field"].setncatts({"units": "", "long_name": ""})  # in HDF5 an attribute without a value
-    volume = read_volume(path)
+
+
+def test_empty_attributes_of_hdf5_say_nothing(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "v.h5", "w") as file:
+        file.create_dataset("field", data=VALUES).attrs.update(
+            {"units": h5py.Empty("S1"), "long_name": h5py.Empty("S1")}
+        )
+    volume = read_volume(str(tmp_path / "v.h5"))
     assert (volume.quantity, volume.values_in) == ("", "")
 
 
