@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.processes import replaced
-from vvgt_cli.conversion import fitting, writing
+from vvgt_cli.conversion import convert, fitting
 from vvgt_cli.conversion.stages import scores, views
 from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.refine import loop
@@ -27,7 +27,7 @@ def folder(tmp_path: Path, vvgt, monkeypatch) -> Path:
 def ended(monkeypatch, target: str, calls: int) -> None:
     """Let the function end the run at its call number ``calls`` (from 0)."""
     module, _, name = target.rpartition(".")
-    owner = {"loop": loop, "fitting": fitting, "writing": writing, "scores": scores, "states": OwnAxes}[module]
+    owner = {"loop": loop, "fitting": fitting, "convert": convert, "scores": scores, "states": OwnAxes}[module]
     own, count = getattr(owner, name), [0]
 
     def call(*args, **kwargs):
@@ -51,7 +51,7 @@ def by_start(scene, start, *_):
         ("states.step", 0, {"closed-form.npz", "cells.npz"}),
         ("states.step", 4, {"closed-form.npz", "cells.npz", "refinement.npz"}),
         ("scores.score_test_views", 0, {"closed-form.npz", "cells.npz", "refinement.npz", "fitted.npz"}),
-        ("writing.write_gaussians", 0, {"closed-form.npz", "cells.npz", "refinement.npz", "fitted.npz"}),
+        ("convert.write_gaussians", 0, {"closed-form.npz", "cells.npz", "refinement.npz", "fitted.npz"}),
     ],
 )
 def test_a_conversion_resumes_where_it_was_ended(target, calls, left, folder, vvgt, monkeypatch):

@@ -88,7 +88,7 @@ def test_pictures_of_parts_compose_to_that_of_the_volume(volume: Path, light: st
         if not left.centre[0] < camera.position[0] < right.centre[0]:
             whole = render_view(scene, camera, settings)
             assert whole[..., 3].max() > 0.5
-            np.testing.assert_allclose(first + (1 - first[..., 3:]) * second, whole, atol=2e-4)
+            np.testing.assert_allclose(first + (1 - first[..., 3:]) * second, whole, atol=3e-4)
 
 
 def test_a_part_is_shown_through_what_lies_before_it(volume: Path) -> None:

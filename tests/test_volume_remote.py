@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import io
 import json
 import sys
 import threading
@@ -142,9 +143,10 @@ def test_what_cannot_be_is_a_line(vvgt, address: str, monkeypatch: pytest.Monkey
 
 def test_other_codecs_than_were_checked_are_refused(address, folder, monkeypatch) -> None:
     told = json.loads((folder / "t.zarr" / ".zarray").read_text()) | {"compressor": {"id": "zlib", "level": 1}}
-    real = Remote.read_text
-    told_of = lambda self, encoding: json.dumps(told) if self.name == ".zarray" else real(self, encoding)  # noqa: E731
-    monkeypatch.setattr(Remote, "read_text", told_of)
+    real = Remote.open
+    false = json.dumps(told).encode()
+    told_of = lambda self, mode: io.BytesIO(false) if self.name == ".zarray" else real(self, mode)  # noqa: E731
+    monkeypatch.setattr(Remote, "open", told_of)
     monkeypatch.setattr("vvgt_cli.volume.arrays.zarr._CODECS", {"zlib"})  # the array itself has another one
     refused(DataError, "codec", read_volume, f"{address}/t.zarr", ReadOptions(time=0))
 
@@ -154,11 +156,11 @@ def test_other_codecs_of_coordinates_are_refused(address: str, folder: Path, mon
     values = group.create_array("v", shape=(8, 9, 10), dtype="uint8", compressors=None)
     values.attrs["_ARRAY_DIMENSIONS"] = ["z", "y", "x"]
     group.create_array("x", shape=(10,), dtype="float32")[:] = np.arange(10)
-    plain, real = (folder / "c.zarr" / "v" / ".zarray").read_text(), Remote.read_text
+    plain, real = (folder / "c.zarr" / "v" / ".zarray").read_text(), Remote.open
     told = json.dumps(json.loads(plain) | {"shape": [10]})
-    told_of = lambda self, encoding: told if str(self).endswith("x/.zarray") else real(self, encoding)  # noqa: E731
+    told_of = lambda self, mode: io.BytesIO(told.encode()) if str(self).endswith("x/.zarray") else real(self, mode)  # noqa: E731
     assert read_volume(f"{address}/c.zarr:/v").dims == (10, 9, 8)
-    monkeypatch.setattr(Remote, "read_text", told_of)
+    monkeypatch.setattr(Remote, "open", told_of)
     monkeypatch.setattr("vvgt_cli.volume.arrays.zarr._CODECS", set[str]())  # the array itself has one
     refused(DataError, "codec", read_volume, f"{address}/c.zarr:/v")
 

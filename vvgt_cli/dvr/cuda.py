@@ -80,11 +80,12 @@ def cast(
         u1 = table_coordinate(value, optics)
         met = values_met(before, u0, u1, flat)
         if met[0] >= 0.0 and met[1] > optics.dark[U(int(met[0]))]:
+            before_it = trans
             own, trans, s = pass_segment(voxels, optics, p, d, t - dt, dt, u0, u1, met, zeros4(), trans)
             if light is None:
                 seen = add(seen, own)
             elif lane(own, 3) > 0.0:
-                r, g, b = shade_segment(own, light, voxels.values, p, d, look, s, t - dt, dt)
+                r, g, b = shade_segment(own, light, voxels.values, p, d, look, s, t - dt, dt, before_it)
                 red, green, blue = red + r, green + g, blue + b
         before, u0 = u0, u1
         i += 1

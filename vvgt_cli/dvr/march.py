@@ -43,7 +43,7 @@ from vvgt_cli.jit.decorators import inlined, parallel_kernel
 from vvgt_cli.jit.threads import ThreadSlice, iterations, next_iteration
 
 P = ParamSpec("P")
-SHADED_TWICE = 0.03  # of a pixel: a normal of noisy data turns within half a voxel
+SHADED_TWICE = 0.03  # of the light: a normal of noisy data turns within half a voxel
 LEAP = 8  # samples of a grid between two looks at the empty-space map
 
 _jit = inlined(fastmath=FLAGS, error_model="numpy", borrowed=True)
@@ -52,15 +52,25 @@ _exact = inlined(error_model="numpy", borrowed=True)  # the same on both sides o
 
 @_jit
 def shade_segment(
-    own: Quad, light: Light, values: np.ndarray, p: Vector, d: Vector, look: Vector, s: float, t: float, dt: float
+    own: Quad,
+    light: Light,
+    values: np.ndarray,
+    p: Vector,
+    d: Vector,
+    look: Vector,
+    s: float,
+    t: float,
+    dt: float,
+    trans: float,
 ) -> tuple[float, float, float]:
     """Shade a segment's ``own`` (r, g, b, alpha), seen along ``look``; no colour exceeds its alpha.
 
-    It goes from t to t + dt and absorbs, on average, at p + s d: light is taken there, or as the mean of a quarter of
-    dt before and behind, where the segment shows more than `SHADED_TWICE`.
+    It goes from t to t + dt, ``trans`` of the light passes what is before it, and it absorbs, on average, at p + s d.
+    Light is taken there, or, where it absorbs more than `SHADED_TWICE`, as the mean of a quarter of dt before and
+    behind.
     """
     most = lane(own, 3)
-    times, apart = (2, 0.5 * dt) if most > SHADED_TWICE else (1, 0.0)
+    times, apart = (2, 0.5 * dt) if most > SHADED_TWICE * trans else (1, 0.0)
     red = green = blue = 0.0
     for n in range(times):
         at = min(max(s + (n - 0.5) * apart, t), t + dt)
@@ -105,9 +115,10 @@ def _through_values(
                     if light is None:
                         seen, trans, _ = pass_segment(voxels, optics, p, d, here, dt, u0, u1, met, seen, trans)
                     else:
+                        ahead = trans
                         own, trans, s = pass_segment(voxels, optics, p, d, here, dt, u0, u1, met, zeros4(), trans)
                         if lane(own, 3) > 0.0:
-                            r, g, b_ = shade_segment(own, light, voxels.values, p, d, look, s, here, dt)
+                            r, g, b_ = shade_segment(own, light, voxels.values, p, d, look, s, here, dt, ahead)
                             red, green, blue = red + r, green + g, blue + b_
                     if trans < opaque:
                         break
@@ -149,8 +160,9 @@ def _through_texels(
             if light is None:
                 seen, trans = blend_texels(a, b, dt, seen, trans)
             else:
+                ahead = trans
                 own, trans = blend_texels(a, b, dt, zeros4(), trans)
-                r, g, b_ = shade_segment(own, light, voxels.values, p, d, look, t - 0.5 * dt, t - dt, dt)
+                r, g, b_ = shade_segment(own, light, voxels.values, p, d, look, t - 0.5 * dt, t - dt, dt, ahead)
                 red, green, blue = red + r, green + g, blue + b_
         a, known = b, True
         i += 1
@@ -306,7 +318,7 @@ def _segments(
 ) -> None:  # fmt: skip
     """Write what a block shows of rays into ``out`` (n, m, 4) float32 premultiplied, which holds zeros.
 
-    Everything up to ``light`` is of the block with a voxel around it, two where it is lit, whose first voxel is
+    Everything up to ``light`` is of the block with two voxels around it, whose first voxel is
     ``begin`` (3,) of the whole volume; ``faces`` (3, 3): the block's lower and upper faces, infinite where the volume
     ends, and the volume's voxels, each (x, y, z); ``pixels`` (n, 2: column, row), ``offsets`` (m, 2), ``eye``,
     ``basis`` and ``lens`` as in `_tiles`, in voxels of the whole volume; ``step`` at most 1.

@@ -11,7 +11,7 @@ from vvgt_cli.closed_form.columns import FIRST, MASS, MOMENTS
 from vvgt_cli.dvr.layout import Light, Texels, Voxels
 from vvgt_cli.field.block_store import CELLS, BlockStore
 from vvgt_cli.field.grid import CellGrid
-from vvgt_cli.field.rays import HALO, LIT_HALO, RayFile, save_rays
+from vvgt_cli.field.rays import HALO, RayFile, save_rays
 from vvgt_cli.field.reader import Layers, Scalars, VoxelBox
 from vvgt_cli.files import atomic_write
 
@@ -64,7 +64,7 @@ class CellBlocks(Blockwise):
     def __call__(self, number: int) -> None:
         """Save the cells of block ``number``, what its rays see, and a summary of each tile."""
         grid, store = self.grid, self.store
-        box = self.box(number, HALO if self.light is None else LIT_HALO)
+        box = self.box(number, HALO)
         tiles, counts, coarse, field, deepest = [], [], [], [], 0.0
         normals = [np.empty((0, 3))]
         with (
@@ -160,7 +160,7 @@ class RayBlocks(Blockwise):
 
     def __call__(self, number: int) -> None:
         """Save what the rays see of block ``number``."""
-        box = self.box(number, HALO if self.light is None else LIT_HALO)
+        box = self.box(number, HALO)
         save_rays(self.rays, box, number, self.grid.blocks, self.light, self.store)
 
 
@@ -179,7 +179,7 @@ class PointBlocks(Blockwise):
         which = np.flatnonzero(((points >= low) & (points < high)).all(axis=1))
         normals = np.empty((0, 4))
         if len(which):
-            normals = normals_in(self.box(number, LIT_HALO), points[which], np.array(self.grid.step))
+            normals = normals_in(self.box(number, HALO), points[which], np.array(self.grid.step))
         self.store.save(self.kind, number, which=which, normals=normals)
 
 
@@ -210,7 +210,7 @@ class ValueBlocks(Blockwise):
         values, numbers = np.empty(0, np.float32), np.empty(0, np.int64)
         sums = np.zeros((len(which), NORMAL_SUMS))
         if len(which):
-            box = self.box(number, LIT_HALO)
+            box = self.box(number, HALO)
             some, part = np.array(rows[which]), (box.begin.astype(np.int64), lo.astype(np.int64), hi.astype(np.int64))
             where = some[:, :3].copy(), some[:, 3:].reshape(-1, 3, 3).copy()
             samples, sums = samples_of(box.voxels, *where, *part, np.array(self.grid.step))

@@ -9,7 +9,7 @@ import numpy as np
 from vvgt_cli.cameras import Blocks, Camera
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.dvr.render import BoxFrame, RenderSettings, camera_arrays, for_thin, tiers
-from vvgt_cli.field.rays import HALO, LIT_HALO, LONGEST, Bundle, caster, meeting
+from vvgt_cli.field.rays import HALO, LONGEST, Bundle, caster, meeting
 from vvgt_cli.field.reader import Layers, Scalars, VoxelBox
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.frames import rescale
@@ -36,7 +36,7 @@ class VolumePart:
         """Read the voxels ``lo`` to ``hi`` (3,), x first, of a volume of ``dims`` voxels with this ``frame``."""
         from vvgt_cli.dvr.bricks import brick_ranges, empty_distance
 
-        halo = REACH + (HALO if light is None else LIT_HALO)
+        halo = REACH + HALO
         self.box: VoxelBox = reader.box(np.maximum(lo - halo, 0), np.minimum(hi + halo, dims))
         self._lo, self._hi, self._dims, self._frame, self._light = lo, hi, dims, frame, light
         self.centre = (lo + hi) / 2 * frame.step - frame.half

@@ -27,7 +27,7 @@ from vvgt_cli.volume.stored import give_back
 SUFFIX = ".rays.npy"
 RAY = np.dtype([("ray", np.int32), ("rgba", np.float32, 4)])  # number of a ray in its bundle, and its colour in a piece
 LONGEST = 1.0  # step in voxels, so that the last one ends within a voxel of its piece
-HALO, LIT_HALO = 1, 2  # voxels around a block that are read with it
+HALO = 2  # voxels around a block that are read with it: the sample before its first, and for normals
 
 
 class Bundle(NamedTuple):
@@ -108,15 +108,15 @@ def save_rays(
 ) -> None:
     """Cast all rays through the pieces of block ``number`` of ``blocks``, and save what they see.
 
-    ``block`` has `HALO` or, under light, `LIT_HALO` voxels around it.
+    ``block`` has `HALO` voxels around it.
     """
-    pieces, halo, kind = pieces_of(blocks.dims), HALO if light is None else LIT_HALO, rays.kind
+    pieces, kind = pieces_of(blocks.dims), rays.kind
     lo, hi = blocks.at(number)
     table: list[tuple[int, int, int]] = []  # piece, bundle, rays
     results: list[np.ndarray] = []
     for piece in _within(pieces, lo, hi):
         first, last = pieces.at(piece)
-        for k, seen in _piece_rays(rays, block.part(first - halo, last + halo), first, last, blocks.dims, light):
+        for k, seen in _piece_rays(rays, block.part(first - HALO, last + HALO), first, last, blocks.dims, light):
             table.append((piece, k, len(seen)))
             results.append(seen)
     with atomic_write(store.path(kind, number, SUFFIX), overwrite=True) as temporary, open(temporary, "wb") as stream:

@@ -21,7 +21,7 @@ MUCH = 1 << 27  # voxels from which several processes are quicker than one
 MANY = 3_000_000  # Gaussians above which they are refined region by region: fewer fit in memory with their cells
 A_WORKER = 1 << 30  # bytes of memory of a worker
 EACH = 4  # blocks for each worker, so that none waits long for the last
-HALOS = 4  # voxels along an edge that are read with a block, two on each side under light
+HALOS = 4  # voxels along an edge that are read with a block, two on each side
 COUNTED = 3  # extra bytes per voxel of types whose values are counted
 ALWAYS = 300 << 20  # bytes of each process: libraries, coarse grids, a tile's tree, a batch of Gaussians
 
