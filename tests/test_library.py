@@ -227,7 +227,7 @@ def test_the_library_goes_through_blocks_too(tmp_path):
     whole, blocks = (vvgt.convert(tmp_path / "v_28x24x20_float32.raw", TF, **HOW, blocks=b) for b in (None, 16))
     assert blocks.scores["psnr"] == pytest.approx(whole.scores["psnr"], abs=0.1)
     assert blocks.preview(48).shape == (144, 144, 3)  # pictures that nobody foresaw
-    np.testing.assert_allclose(blocks.preview(48)[:, :48], whole.preview(48)[:, :48], atol=0.02)  # each block is sampled finely
+    np.testing.assert_allclose(blocks.preview(48)[:, :48], whole.preview(48)[:, :48], atol=0.02)
 
 
 @pytest.mark.parametrize(
