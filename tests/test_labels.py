@@ -63,6 +63,14 @@ def test_tables_of_every_program(tmp_path: Path, text: str, name: str) -> None:
     assert (skin.opacity, core.opacity) == (1.0 if "nrrd" in name else pytest.approx(0.5, abs=0.01), 1.0)
 
 
+def test_a_name_of_null_is_none(tmp_path: Path) -> None:
+    stated = [
+        read_labels(table(tmp_path, json.dumps({"7": entry}), "a.json")).labels[-1].name
+        for entry in ({"name": None, "color": [1, 0, 0]}, {"color": [1, 0, 0]})
+    ]
+    assert stated[0] == stated[1] != "None"
+
+
 def test_a_function_of_whole_numbers() -> None:
     found = distinct(range(65_536))
     x = np.array([0, 1, 3, 1.5, -1, np.nan, 65_535, 70_000])

@@ -14,6 +14,7 @@ from tests.test_page_look import options, page_of
 from vvgt_cli.closed_form.labelled import labels_and_gradients
 from vvgt_cli.conversion.live import label_fog
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
+from vvgt_cli.gaussians.formats import read_columns
 from vvgt_cli.gaussians.header import legend_text
 from vvgt_cli.gaussians.live import Palette, apply_look, baked, opacities, visible_under
 from vvgt_cli.gaussians.live_facts import LABEL_ROW, LiveFacts
@@ -76,6 +77,9 @@ def test_a_ply_keeps_labels_in_a_byte_and_names_in_its_header(tmp_path: Path) ->
     write_ply(tmp_path / "b.ply", last, PlyOptions(live=facts(many)))
     assert read_ply(tmp_path / "b.ply")[1].dtype["label"] == np.dtype("<u2")
     assert read_ply(tmp_path / "b.ply")[0].live[0, LABEL_ROW] == 299  # type: ignore[index]
+    long = tuple(replace(label, name="\u97f3" * 200) for label in many)
+    write_ply(tmp_path / "e.ply", last, PlyOptions(live=facts(long)))
+    assert read_columns(tmp_path / "e.ply").comments == read_ply(tmp_path / "e.ply")[1].comments
     whole = (tmp_path / "a.ply").read_bytes()
     (tmp_path / "c.ply").write_bytes(whole.replace(b"live label 300", b"live labex 300", 1))
     refused(vvgt_library.DataError, "expected one that vvgt writes", read_ply, tmp_path / "c.ply")

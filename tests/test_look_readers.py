@@ -137,6 +137,7 @@ def test_minimal_json_on_percentiles(file):
         ({"range": [0, 1]}, "with a range expected x in"),
         ({"range": "percentile"}, "expected x in"),
         ({"opacity_unit_distance": 0}, "unit distance 0"),
+        ({"hsv_wrap": "false"}, "hsv_wrap 'false'; expected true or false"),
         ({"rnage": [0, 1]}, "unknown key 'rnage'; expected color_space"),
     ],
 )

@@ -70,7 +70,7 @@ def shade_segment(
     behind.
     """
     most = lane(own, 3)
-    times, apart = (2, 0.5 * dt) if most > SHADED_TWICE * trans else (1, 0.0)
+    times, apart = (2, 0.5 * dt) if most > SHADED_TWICE * trans and not light.traced else (1, 0.0)
     red = green = blue = 0.0
     for n in range(times):
         at = min(max(s + (n - 0.5) * apart, t), t + dt)

@@ -24,7 +24,7 @@ class PreparedVolume:
 
     Attributes:
         values, slope, intercept: of `kernel_values`.
-        ranges: (bz, by, bx, 2) stored values of each brick, NaN where none is finite.
+        ranges: (bz, by, bx, 2) stored values of each brick, (inf, -inf) where none is finite.
     """
 
     values: np.ndarray

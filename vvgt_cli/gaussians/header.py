@@ -25,6 +25,7 @@ REQUIRED = (
 _BASIC = {"char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4"}
 _SIZED = {"int8": "i1", "uint8": "u1", "int16": "<i2", "uint16": "<u2", "int32": "<i4", "uint32": "<u4"}
 TYPES = _BASIC | _SIZED | {"float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8"}
+MAX_BYTES = 1 << 20  # of the longest header that is accepted
 CERTIFICATE = "certificate"  # keyword of the comment
 MIP = "SplatRenderMode: mip"  # Brush's marker for opacity compensated for dilation
 _ADVICE = "expected a binary little-endian 3DGS .ply, as written by vvgt and SuperSplat"
@@ -102,15 +103,15 @@ class PlyHeader(FileFacts):
 
 
 def header_lines(content: bytes, name: str) -> tuple[list[str], int]:
-    """Return the header's lines and its size in bytes."""
+    """Return the lines of the header, of at most `MAX_BYTES` bytes, and its size in bytes."""
     if not content.startswith((b"ply\n", b"ply\r\n")):
         raise DataError(f"{name}: starts with {content[:8]!r}, not with 'ply'; {_ADVICE}")
     position = 0
     lines: list[str] = []
     while True:
-        end = content.find(b"\n", position)
+        end = content.find(b"\n", position, MAX_BYTES)
         if end < 0:
-            raise DataError(f"{name}: no 'end_header' in the first {len(content)} bytes; {_ADVICE}")
+            raise DataError(f"{name}: no 'end_header' in the first {min(len(content), MAX_BYTES)} bytes; {_ADVICE}")
         try:
             line = content[position:end].decode("utf-8").strip()
         except UnicodeDecodeError:

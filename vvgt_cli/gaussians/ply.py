@@ -14,7 +14,7 @@ import numpy as np
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians.frames import rescale, turn, up_matrix
-from vvgt_cli.gaussians.header import REQUIRED, FileFacts, PlyHeader, comment_lines, parse_header, rest_names
+from vvgt_cli.gaussians.header import MAX_BYTES, REQUIRED, FileFacts, PlyHeader, comment_lines, parse_header, rest_names
 from vvgt_cli.gaussians.live_facts import COLUMNS, GRADIENT, LABEL, LABEL_ROW, LAYER, LAYER_ID, NXYZ, VALUES, LiveFacts
 from vvgt_cli.gaussians.story import Story
 from vvgt_cli.gaussians.types import HARMONICS, SH_C0, Gaussians
@@ -22,7 +22,6 @@ from vvgt_cli.volume.space import axis_facts
 
 FRAMES = ("unit", "world")
 OPAQUE = 16.0  # logit of an opacity of 1 - 1e-7
-_HEADER_LIMIT = 1 << 20  # bytes of the longest header that is accepted
 
 
 @dataclass(frozen=True)
@@ -191,7 +190,7 @@ def _rows(source: str | Path | BinaryIO, name: str) -> tuple[PlyHeader, np.ndarr
     """Read the header and structured rows; the size is checked before anything is allocated."""
     if isinstance(source, str | Path):
         with open(seekable(source), "rb") as stream:
-            header = parse_header(stream.read(_HEADER_LIMIT), name)
+            header = parse_header(stream.read(MAX_BYTES), name)
             size = stream.seek(0, io.SEEK_END)
             check_size(header, size, name)
             if not header.count:
@@ -199,7 +198,7 @@ def _rows(source: str | Path | BinaryIO, name: str) -> tuple[PlyHeader, np.ndarr
             rows = np.memmap(stream, dtype=header.dtype, mode="r", offset=header.size, shape=(header.count,))
         return header, rows
     content = source.read()
-    header = parse_header(content[:_HEADER_LIMIT], name)
+    header = parse_header(content, name)
     check_size(header, len(content), name)
     return header, np.frombuffer(content, dtype=header.dtype, count=header.count, offset=header.size)
 

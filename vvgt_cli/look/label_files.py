@@ -333,7 +333,7 @@ def _entry(here: str, value: int, entry: dict[str, Any], most: float = 1) -> Lab
         raise DataError(f"{here}: parents {str(groups)[:40]!r}; expected names of groups: [..., ...]")
     if not isinstance(shown, bool):
         raise DataError(f"{here}: visible {str(shown)[:40]!r}; expected true or false")
-    label = _label(here, value, str(entry.get("name", "")), color, opacity, shown)
+    label = _label(here, value, str(entry.get("name") or ""), color, opacity, shown)
     return replace(label, parents=tuple(one[:MAX_NAME] for one in groups)) if groups else label
 
 

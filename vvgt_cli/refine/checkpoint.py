@@ -137,7 +137,7 @@ def resume(path: str, key: str, state: State, checks: Checks, record: OptimizeRe
         described["checks"] = [tuple(look) for look in described["checks"]]
     except _FAULTS as error:
         text = " ".join(str(error).split())[:200]
-        raise DataError(f"{path}: not a checkpoint of 'vvgt optimize' ({text}); remove it to start afresh") from None
+        raise DataError(f"{path}: not a checkpoint of gradient descent ({text}); remove it to start afresh") from None
     checks.best, checks.idle, checks.kept = best, idle, kept or None
     for field, value in described.items():
         setattr(record, field, value)

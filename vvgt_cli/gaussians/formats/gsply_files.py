@@ -59,7 +59,7 @@ def compressed_ply(splats: Splats, name: str, order: np.ndarray | None = None) -
 def read_compressed_ply(content: bytes, name: str) -> Splats:
     """Read the columns of a `.compressed.ply`; raise DataError if gsply cannot, or is not installed."""
     library = gsply(name)
-    lines, size = header_lines(content[: 1 << 18], name)
+    lines, size = header_lines(content, name)
     with library_errors(name, "a compressed .ply"):
         data = library.decompress_from_bytes(_in_order(content, lines, size))
         return _columns(data, [line[8:] for line in lines if line.startswith("comment ")])

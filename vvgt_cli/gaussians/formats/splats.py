@@ -71,7 +71,7 @@ def splats_of(gaussians: Gaussians, options: PlyOptions) -> Splats:
 
 def columns_of(content: bytes, name: str) -> Splats:
     """Return the columns of a standard `.ply`, or raise DataError."""
-    header = parse_header(content[: 1 << 16], name)
+    header = parse_header(content, name)
     rows = np.frombuffer(content, header.dtype, header.count, header.size)
 
     def columns(*names: str) -> np.ndarray:

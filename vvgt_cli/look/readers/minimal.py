@@ -68,7 +68,9 @@ def read(parsed: dict[str, Any], what: str, pick: str = "") -> TransferFunction:
     share = parsed.get("opacity_unit_share")
     if share is not None and (distance is not None or not 0 < number(f"{what}: opacity_unit_share", share) <= 1):
         raise DataError(f"{what}: opacity_unit_share {share}; expected above 0 to 1, without opacity_unit_distance")
-    otherwise = _otherwise(parsed, what)
+    otherwise, wrap = _otherwise(parsed, what), parsed.get("hsv_wrap", True)
+    if not isinstance(wrap, bool):
+        raise DataError(f"{what}: hsv_wrap {wrap!r}; expected true or false")
     (xo, y), (xc, c) = zip(*opacities, strict=True), zip(*colors, strict=True)
     try:
         if domain == "data" and hi > lo:
@@ -78,7 +80,7 @@ def read(parsed: dict[str, Any], what: str, pick: str = "") -> TransferFunction:
         return TransferFunction(
             str(parsed.get("name", "")).strip() or "transfer function",
             PiecewiseOpacity(np.array(xo), np.array(y)),
-            ColorMap(np.array(xc), np.array(c), space=space, hsv_wrap=bool(parsed.get("hsv_wrap", True))),
+            ColorMap(np.array(xc), np.array(c), space=space, hsv_wrap=wrap),
             distance if label == "file" else None,
             domain,
             share,
