@@ -7,12 +7,11 @@ neighbours in what comes of it. Moments are gathered about each cell's corner an
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
 from vvgt_cli.closed_form.columns import BLUE, GREEN, MASS, MOMENTS, RED, XX, XY, XZ, YY, YZ, ZZ, X, Y, Z
-from vvgt_cli.dvr.kernel import FLAGS, U, Vector, mean_optics, table_coordinate
+from vvgt_cli.dvr.kernel import FLAGS, U, mean_optics, table_coordinate
 from vvgt_cli.dvr.layout import LIT_GRID, TUPLES, Optics, Texels, Voxels
 from vvgt_cli.dvr.vectors import add, lane, mix, texel, zeros4
 from vvgt_cli.dvr.vectors import row as row_of
@@ -160,20 +159,6 @@ def shift_moments(row: np.ndarray, x: float, y: float, z: float, d: tuple[float,
 
 
 @_jit
-def shift_block(rows: np.ndarray, begin: Vector, cell: Any, half: np.ndarray, step: np.ndarray, d: Vector) -> None:
-    """Apply `shift_moments` to the ``rows`` (cells z, y, x, 13) of a block from voxel ``begin`` of the whole volume on.
-
-    ``cell`` is a cell's edges in voxels.
-    """
-    for cz, cy, cx in np.ndindex(rows.shape[:3]):
-        if rows[cz, cy, cx, MASS] > 0.0:
-            x = (begin[0] + cx * cell[0]) * step[0] - half[0]
-            y = (begin[1] + cy * cell[1]) * step[1] - half[1]
-            z = (begin[2] + cz * cell[2]) * step[2] - half[2]
-            shift_moments(rows[cz, cy, cx], x, y, z, d)
-
-
-@_jit
 def _texel_row(values: np.ndarray, y: Between, z: Between, first: int, out: np.ndarray) -> bool:
     """Write voxels from ``first`` on, between rows, into ``out`` (n, 4); return whether any has extinction.
 
@@ -261,7 +246,12 @@ def _moments(
                     _gather(u0, u1, optics, points[0], box[0], ly, lz, out[b, cz, cy])
                 elif _texel_row(texels.values, near_y, near_z, first, row):
                     _gather_texels(row, at, share, points[0], box[0], ly, lz, out[b, cz, cy])
-        shift_block(out[b], (begin[0] + x0, begin[1] + y0, begin[2] + z0), cell, half, step, box)
+        for cz, cy, cx in np.ndindex(out.shape[1:4]):
+            if out[b, cz, cy, cx, MASS] > 0.0:
+                x = (begin[0] + x0 + cx * cell[0]) * step[0] - half[0]
+                y = (begin[1] + y0 + cy * cell[1]) * step[1] - half[1]
+                z = (begin[2] + z0 + cz * cell[2]) * step[2] - half[2]
+                shift_moments(out[b, cz, cy, cx], x, y, z, box)
 
 
 REST = "f8:2 i8:1 f8:1 f8:1 f8:1 f8:1 f8:5"
