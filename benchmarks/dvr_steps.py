@@ -22,7 +22,7 @@ from floors import alternate, machine
 
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.dvr import RenderSettings, Scene, render_view
-from vvgt_cli.dvr.kernel import FLAGS, OPAQUE, absorbed, box_span, leap, mean_optics, sample, table_coordinate
+from vvgt_cli.dvr.kernel import FLAGS, OPAQUE, absorbed, box_span, inverse, leap, mean_optics, sample, table_coordinate
 from vvgt_cli.dvr.layout import BRICK_BITS
 from vvgt_cli.dvr.reference import rays
 from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
@@ -56,7 +56,8 @@ def _plain(voxels, optics, empty, eye, directions, step, out):
             reach = int(empty[bk, bj, bi])
             i += 1
             if reach > 0:
-                i = max(math.ceil((leap(px, py, pz, dx, dy, dz, reach, bi, bj, bk) - t0) / dt - 0.5), i)
+                end = leap(px, py, pz, inverse(dx), inverse(dy), inverse(dz), reach, bi, bj, bk)
+                i = max(math.ceil((end - t0) / dt - 0.5), i)
                 continue
             u = table_coordinate(sample(values, x, y, z), optics)
             if u >= 0.0:

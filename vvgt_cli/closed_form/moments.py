@@ -15,7 +15,7 @@ import numpy as np
 
 from vvgt_cli.closed_form.cell_kernels import morton_codes
 from vvgt_cli.closed_form.columns import MASS, MOMENTS
-from vvgt_cli.closed_form.quadrature import block_moments, compact
+from vvgt_cli.closed_form.quadrature import block_moments, compact, grid_moments
 from vvgt_cli.dvr.bricks import visible_blocks
 from vvgt_cli.dvr.layout import BRICK, Optics, Texels, Voxels
 from vvgt_cli.dvr.scene import Scene
@@ -148,13 +148,9 @@ def region_cells(
 
 def _integrate(region: Region, at: np.ndarray, points: np.ndarray, cell: np.ndarray, out: np.ndarray) -> None:
     """Compute `block_moments` by the kernel of the region's kind."""
-    where = region.half, region.step, region.begin
-    if region.texels is None:
-        block_moments(region.voxels, region.optics, at, points, cell, *where, out)
-    else:
-        from vvgt_cli.closed_form.grid import grid_moments  # loaded for what needs it only
-
-        grid_moments(region.texels, at, points, cell, *where, out)
+    kernel = block_moments if region.texels is None else grid_moments
+    scene = region.voxels, region.optics, region.texels
+    kernel(*scene, at, points, cell, region.half, region.step, region.begin, out)
 
 
 def _integrate_voxels(region: Region, at: np.ndarray, exponent: np.ndarray, out: np.ndarray) -> None:

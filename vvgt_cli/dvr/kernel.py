@@ -210,22 +210,14 @@ def inverse(d: float) -> float:
 
 
 @_jit
-def _exit(
+def leap(
     px: float, py: float, pz: float, ix: float, iy: float, iz: float, reach: int, bi: int, bj: int, bk: int
 ) -> float:
-    """Return the t at which the cube of bricks within ``reach`` of (bi, bj, bk) ends; ix, iy, iz: `inverse`."""
+    """Return the t at which the empty cube of bricks within ``reach`` of (bi, bj, bk) ends; ix, iy, iz: `inverse`."""
     x = (bi + reach if ix > 0.0 else bi - reach + 1) * BRICK
     y = (bj + reach if iy > 0.0 else bj - reach + 1) * BRICK
     z = (bk + reach if iz > 0.0 else bk - reach + 1) * BRICK
     return min((x - px) * ix, (y - py) * iy, (z - pz) * iz)
-
-
-@_jit
-def leap(
-    px: float, py: float, pz: float, dx: float, dy: float, dz: float, reach: int, bi: int, bj: int, bk: int
-) -> float:
-    """Return the ray parameter at which the empty cube of bricks around (bi, bj, bk) ends, from the ray's origin p."""
-    return _exit(px, py, pz, inverse(dx), inverse(dy), inverse(dz), reach, bi, bj, bk)
 
 
 @_jit
@@ -251,7 +243,7 @@ def skip(
     if reach == 0:
         return i
     while True:
-        i = max(int((_exit(px, py, pz, ix, iy, iz, reach, bi, bj, bk) - t0) * per_step), i)
+        i = max(int((leap(px, py, pz, ix, iy, iz, reach, bi, bj, bk) - t0) * per_step), i)
         if i >= count:
             return count + 1
         t = t0 + (i + 1) * dt

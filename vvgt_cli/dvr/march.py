@@ -197,8 +197,7 @@ def _whole(
     return _march(voxels, optics, texels, empty, light, p, d, t0, (t1 - t0) / count, 0, count, step)
 
 
-@_jit
-def direction(basis: np.ndarray, lens: np.ndarray, x: float, y: float) -> Vector:
+def _direction(basis: np.ndarray, lens: np.ndarray, x: float, y: float) -> Vector:
     """Return the direction of the ray through a point of the picture, in voxels; arguments as of `_tiles`."""
     a, b = (x - lens[2]) * lens[0], (y - lens[3]) * lens[1]
     norm = 1.0 / math.sqrt(a * a + b * b + 1.0)
@@ -207,6 +206,9 @@ def direction(basis: np.ndarray, lens: np.ndarray, x: float, y: float) -> Vector
         (basis[0, 1] * a + basis[1, 1] * b + basis[2, 1]) * norm,
         (basis[0, 2] * a + basis[1, 2] * b + basis[2, 2]) * norm,
     )
+
+
+direction, exact_direction = _jit(_direction), _exact(_direction)
 
 
 @_jit
@@ -275,11 +277,7 @@ def _ray(
     """
     nx, ny, nz = int(faces[2, 0]), int(faces[2, 1]), int(faces[2, 2])
     px, py, pz = p
-    a, b = (column - lens[2]) * lens[0], (row - lens[3]) * lens[1]
-    norm = 1.0 / math.sqrt(a * a + b * b + 1.0)
-    dx = (basis[0, 0] * a + basis[1, 0] * b + basis[2, 0]) * norm
-    dy = (basis[0, 1] * a + basis[1, 1] * b + basis[2, 1]) * norm
-    dz = (basis[0, 2] * a + basis[1, 2] * b + basis[2, 2]) * norm
+    dx, dy, dz = exact_direction(basis, lens, column, row)
     t0, t1 = box_span(px, py, pz, dx, dy, dz, nx, ny, nz)
     if not t1 > t0:
         return (dx, dy, dz), 0.0, 1.0, 0, 0

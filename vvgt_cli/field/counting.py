@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from vvgt_cli.closed_form.samples import SAMPLE, sample_spacing, samples_in
-from vvgt_cli.errors import Unsuitable, UsageError
+from vvgt_cli.errors import UsageError
 from vvgt_cli.field.block_store import COUNTS, HISTOGRAM, LABELS, BlockStore
 from vvgt_cli.field.grid import Boxes
 from vvgt_cli.field.layered import Access, OpenedFile, content_of, open_content
@@ -281,22 +281,12 @@ def _binned(values: np.ndarray, volume: Volume, limits: tuple[float, float]) -> 
 
 
 def with_limits(whole: Tally, volume: Volume) -> Tally:
-    """Check the sum over all blocks and complete it with its limits.
-
-    Raises:
-        Unsuitable: no voxel has a finite value, or the scaling makes values infinite.
-    """
+    """Check the sum over all blocks and complete it with its limits; errors are those of `check_range`."""
     if counted(volume):
         stats = integer_statistics(whole.counts, volume)
         ends = (stats.lo - volume.intercept) / volume.slope, (stats.hi - volume.intercept) / volume.slope
         return replace(whole, lo=stats.lo, hi=stats.hi, stored=(min(ends), max(ends)), finite=volume.data.size)
-    if not whole.finite:
-        inf = volume.data.size - whole.nan
-        raise Unsuitable(
-            f"{volume.name}: none of its {volume.data.size} voxels is finite ({whole.nan} NaN, {inf} infinite); check "
-            "the type and byte order (--dtype, --byte-order)"
-        )
-    check_range(whole.lo, whole.hi, volume)
+    check_range(whole.lo, whole.hi, volume, whole.nan)
     return whole
 
 

@@ -21,7 +21,7 @@ RAYCAST = (RENDER, *RAYCAST_REST)
 GRID = {
     RENDER: "vvgt_cli.dvr.march:render_grid_tiles",
     RENDER_LIT: "vvgt_cli.dvr.march:render_lit_grid_tiles",
-    BLOCK_MOMENTS: "vvgt_cli.closed_form.grid:grid_moments",
+    BLOCK_MOMENTS: "vvgt_cli.closed_form.quadrature:grid_moments",
     PATHS[0]: "vvgt_cli.dvr.paths:gather_grid",
 }
 DRAW = (

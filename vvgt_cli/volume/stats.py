@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vvgt_cli.errors import DataError
+from vvgt_cli.errors import DataError, Unsuitable
 from vvgt_cli.volume.types import Volume
 
 BINS = 256
@@ -52,7 +52,6 @@ def statistics(volume: Volume) -> Statistics:
     if volume.data.dtype.kind in "iub" and volume.data.dtype.itemsize <= 2:
         return integer_statistics(_byte_counts(volume), volume)
     lo, hi, nan_count, inf_count = _range(volume)
-    check_range(lo, hi, volume)
     edges = edges_of(lo, hi)
     histogram = np.zeros(BINS, np.int64)
     for _, slab in slabs(volume):
@@ -61,8 +60,19 @@ def statistics(volume: Volume) -> Statistics:
     return Statistics(lo, hi, nan_count, inf_count, histogram, edges)
 
 
-def check_range(lo: float, hi: float, volume: Volume) -> None:
-    """Raise `DataError` where the least and greatest data value are not finite."""
+def check_range(lo: float, hi: float, volume: Volume, nan: int = 0) -> None:
+    """Check the least and greatest data value, infinity and its negative where none is finite; ``nan`` voxels are NaN.
+
+    Raises:
+        Unsuitable: none is finite.
+        DataError: the scaling makes values infinite.
+    """
+    if lo > hi:
+        size = volume.data.size
+        raise Unsuitable(
+            f"{volume.name}: none of its {size} voxels is finite ({nan} NaN, {size - nan} infinite); check the type "
+            "and byte order (--dtype, --byte-order)"
+        )
     if not (np.isfinite(lo) and np.isfinite(hi)):
         raise DataError(
             f"{volume.name}: data values {volume.slope:g} * stored + {volume.intercept:g} reach from {lo:g} to {hi:g}; "
@@ -153,10 +163,5 @@ def _range(volume: Volume) -> tuple[float, float, int, int]:
             nan_count += int(np.isnan(slab).sum())
         if values.size:
             lo, hi = min(lo, float(values.min())), max(hi, float(values.max()))
-    inf_count = volume.data.size - finite - nan_count
-    if finite == 0:
-        raise DataError(
-            f"{volume.name}: none of its {volume.data.size} voxels is finite ({nan_count} NaN, {inf_count} infinite); "
-            "check the type and byte order (--dtype, --byte-order)"
-        )
-    return lo, hi, nan_count, inf_count
+    check_range(lo, hi, volume, nan_count)
+    return lo, hi, nan_count, volume.data.size - finite - nan_count

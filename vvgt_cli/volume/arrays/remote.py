@@ -80,7 +80,7 @@ class Remote:
         return self._at(self._inner / name.lstrip("/"))
 
     def _at(self, inner: PurePosixPath) -> Remote:
-        return Remote(self._server, self._root, str(inner), self._kept)
+        return type(self)(self._server, self._root, str(inner), self._kept)
 
     @property
     def name(self) -> str:
@@ -165,9 +165,6 @@ def read_scheme(scheme: str, rest: str, options: ReadOptions) -> Volume:
 
 class _Zipped(Remote):
     """A place in a zip file, with the methods that `zarr` calls on a path."""
-
-    def _at(self, inner: PurePosixPath) -> Remote:
-        return _Zipped(self._server, self._root, str(inner), self._kept)
 
     @property
     def parent(self) -> Remote:
