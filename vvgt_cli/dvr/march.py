@@ -66,8 +66,8 @@ def shade_segment(
     """Shade a segment's ``own`` (r, g, b, alpha), seen along ``look``; no colour exceeds its alpha.
 
     It goes from t to t + dt, ``trans`` of the light passes what is before it, and it absorbs, on average, at p + s d.
-    Light is taken there, or, where it absorbs more than `SHADED_TWICE`, as the mean of a quarter of dt before and
-    behind.
+    Light is taken there, or, where the segment absorbs more than `SHADED_TWICE` and light is not traced to a grid, as
+    the mean of a quarter of dt before and behind.
     """
     most = lane(own, 3)
     times, apart = (2, 0.5 * dt) if most > SHADED_TWICE * trans and not light.traced else (1, 0.0)
