@@ -220,6 +220,18 @@ def test_views_with_large_errors_come_first_the_second_time():
     assert found == [next(resumed) for _ in range(48)]  # as a checkpoint has it
 
 
+def test_a_run_tells_the_order_which_views_are_wrong(scene, monkeypatch):
+    start, images, _ = scene
+    wrong, taken = np.array(images), []
+    wrong[2] = 1 - wrong[2]
+    step = OwnAxes.step
+    monkeypatch.setattr(
+        OwnAxes, "step", lambda self, camera, *rest: taken.append(camera.name) or step(self, camera, *rest)
+    )
+    optimize(start, CAMERAS, wrong, OptimizeOptions(steps=len(CAMERAS) + 1))
+    assert taken[-1] == CAMERAS[2].name
+
+
 def test_the_same_run_gives_the_same_bytes(scene):
     start, images, check = scene
     runs = [optimize(start, CAMERAS, images, OptimizeOptions(steps=10), check)[0] for _ in range(2)]

@@ -54,9 +54,9 @@ def test_nan_and_inf_are_counted_not_used(name: str) -> None:
     check(found, data.astype(np.float64))
 
 
-@pytest.mark.parametrize("fill", [np.nan, np.inf])
-def test_nothing_finite_is_an_error(fill: float) -> None:
-    with pytest.raises(DataError, match=r"none of its 8 voxels is finite.*--byte-order"):
+@pytest.mark.parametrize(("fill", "counts"), [(np.nan, "8 NaN, 0 infinite"), (np.inf, "0 NaN, 8 infinite")])
+def test_nothing_finite_is_an_error(fill: float, counts: str) -> None:
+    with pytest.raises(DataError, match=rf"none of its 8 voxels is finite \({counts}\).*--byte-order"):
         statistics(Volume(np.full((2, 2, 2), fill, np.float32)))
 
 

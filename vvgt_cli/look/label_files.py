@@ -333,7 +333,8 @@ def _entry(here: str, value: int, entry: dict[str, Any], most: float = 1) -> Lab
         raise DataError(f"{here}: parents {str(groups)[:40]!r}; expected names of groups: [..., ...]")
     if not isinstance(shown, bool):
         raise DataError(f"{here}: visible {str(shown)[:40]!r}; expected true or false")
-    label = _label(here, value, str(entry.get("name") or ""), color, opacity, shown)
+    name = entry.get("name")
+    label = _label(here, value, "" if name is None else str(name), color, opacity, shown)
     return replace(label, parents=tuple(one[:MAX_NAME] for one in groups)) if groups else label
 
 
@@ -363,7 +364,7 @@ def _annotated(presets: list[dict[str, Any]], what: str, pick: str) -> list[Labe
     if not isinstance(words, list) or not words or not all(_INTEGER.fullmatch(str(one)) for one in words[::2]):
         raise DataError(f"{what}: no Annotations with numbers of labels; expected [number, name, number, name, ...]")
     pairs = enumerate(zip(words[::2], words[1::2], strict=False))
-    shown = [(int(value), {"name": str(name), "color": colors[k % len(colors)].tolist()}) for k, (value, name) in pairs]
+    shown = [(int(value), {"name": name, "color": colors[k % len(colors)].tolist()}) for k, (value, name) in pairs]
     return [_entry(f"{what}: label {value}", value, entry) for value, entry in shown]
 
 

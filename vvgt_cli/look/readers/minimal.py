@@ -52,7 +52,7 @@ def read(parsed: dict[str, Any], what: str, pick: str = "") -> TransferFunction:
         raise DataError(f"{what}: holds one function, no presets; omit #{pick}")
     if "iso" in parsed:
         try:
-            return isosurfaces(parsed["iso"] if set(parsed) <= {"iso", "name"} else (), str(parsed.get("name", "")))
+            return isosurfaces(parsed["iso"] if set(parsed) <= {"iso", "name"} else (), str(parsed.get("name") or ""))
         except (UsageError, TypeError) as error:
             raise DataError(f"{what}: {error}; expected {{'iso': [LEVEL, ...]}}, and perhaps a name") from None
     unknown = sorted(set(parsed) - KEYS)
@@ -78,7 +78,7 @@ def read(parsed: dict[str, Any], what: str, pick: str = "") -> TransferFunction:
                 raise DataError(f"points x in [{min(xo + xc):g}, {max(xo + xc):g}]; with a range expected x in [0, 1]")
             xo, xc = (tuple(lo + (hi - lo) * np.array(x)) for x in (xo, xc))
         return TransferFunction(
-            str(parsed.get("name", "")).strip() or "transfer function",
+            str(parsed.get("name") or "").strip() or "transfer function",
             PiecewiseOpacity(np.array(xo), np.array(y)),
             ColorMap(np.array(xc), np.array(c), space=space, hsv_wrap=wrap),
             distance if label == "file" else None,

@@ -59,7 +59,7 @@ def read(parsed: Any, what: str, pick: str = "") -> TransferFunction:
         raise DataError(f"{what}: ColorSpace {preset['ColorSpace']!r}; expected one of {', '.join(SPACES)}")
     if unused := [key for key in UNUSED if preset.get(key)]:
         warnings.warn(f"{what}: {', '.join(unused)} not used; colours come from RGBPoints alone", stacklevel=2)
-    name = str(preset.get("Name", "")).strip() or "ParaView preset"
+    name = str(preset.get("Name") or "").strip() or "ParaView preset"
     if "OpacityPoints" in preset:
         opacity_nodes = table(f"{what}: OpacityPoints", preset["OpacityPoints"], 2, "x, opacity")
     elif preset.get("Points") is not None:
