@@ -207,31 +207,6 @@ def test_views_in_a_row_are_far_apart_and_each_is_seen_once_a_round():
     assert [next(again) for _ in range(len(found))] == found
 
 
-def test_views_with_large_errors_come_first_the_second_time():
-    cameras, errors, found = default_views("train", 24, size=32), [], []
-    order = spread_views(cameras, 0, errors)
-    for _ in range(48):
-        found.append(next(order))
-        errors.append(9.0 if found[-1] in (5, 17) else 1.0)
-    assert sorted(found[24:26]) == [5, 17]
-    assert sorted(found[24:]) == list(range(24))
-    plain, resumed = spread_views(cameras, 0), spread_views(cameras, 0, errors)
-    assert found[:24] == [next(plain) for _ in range(24)]
-    assert found == [next(resumed) for _ in range(48)]  # as a checkpoint has it
-
-
-def test_a_run_tells_the_order_which_views_are_wrong(scene, monkeypatch):
-    start, images, _ = scene
-    wrong, taken = np.array(images), []
-    wrong[2] = 1 - wrong[2]
-    step = OwnAxes.step
-    monkeypatch.setattr(
-        OwnAxes, "step", lambda self, camera, *rest: taken.append(camera.name) or step(self, camera, *rest)
-    )
-    optimize(start, CAMERAS, wrong, OptimizeOptions(steps=len(CAMERAS) + 1))
-    assert taken[-1] == CAMERAS[2].name
-
-
 def test_the_same_run_gives_the_same_bytes(scene):
     start, images, check = scene
     runs = [optimize(start, CAMERAS, images, OptimizeOptions(steps=10), check)[0] for _ in range(2)]

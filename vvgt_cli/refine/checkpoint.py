@@ -34,7 +34,7 @@ _FAULTS = (
     *(zipfile.BadZipFile, struct.error),
 )
 
-STEPPED = 7  # raised when the same start and options step otherwise, or what is kept has other names
+STEPPED = 6  # raised when the same start and options step otherwise, or what is kept has other names
 
 
 class Checks:

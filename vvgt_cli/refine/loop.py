@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -38,7 +38,7 @@ def run(
     checks = Checks(state, check, record, options.check_rule)
     keep, course = _checkpoint(options, gaussians, (cameras, images), check, state, checks)
     entered, half = time.perf_counter(), 0 if options.early is None else options.early // 2
-    order = spread_views(cameras, options.seed, course.errors)
+    order = spread_views(cameras, options.seed)
     if not record.checks:
         checks.measure(0.0)
         record.psnr_before = checks.best
@@ -57,8 +57,7 @@ def run(
         view = next(order)
         share = _share(options, record.steps, course.elapsed)
         weight = None if weights is None else weights[view]
-        error = state.step(cameras[view], images[view], share, course.speed, weight)
-        course.errors += [] if error is None else [error]
+        state.step(cameras[view], images[view], share, course.speed, weight)
         record.steps += 1
         if record.steps == half:
             checks.measure(time.perf_counter() - began)
@@ -85,13 +84,12 @@ def run(
 
 @dataclass
 class _Course:
-    """Values that change from step to step beside the state; ``errors`` of `spread_views`."""
+    """Values that change from step to step beside the state."""
 
     speed: float = 1.0
     elapsed: float = 0.0
     scored: int = 0
     ends: int | None = None  # the step after which the run ends, once decided halfway to an early end
-    errors: list[float] = field(default_factory=list)
 
 
 def _checkpoint(
@@ -119,29 +117,23 @@ def begin(
     return OwnAxesOnDevice(gaussians, cameras, options, free)
 
 
-def spread_views(cameras: Sequence[Camera], seed: int, errors: Sequence[float] = ()) -> Iterator[int]:
+def spread_views(cameras: Sequence[Camera], seed: int) -> Iterator[int]:
     """Yield all views, then all again, each from where fewest of the last ones were seen from.
 
     A step follows one view's slopes; those of views side by side are alike, so that views far apart in a row make a
-    better mean of all. ``seed`` decides which is first, and between equals. From the second time on, views with large
-    errors come earlier, because the run may end before all are taken: ``errors`` has the RMS error of the picture of
-    each step, and grows with the steps; without it, only places count.
+    better mean of all. ``seed`` decides which is first, and between equals.
     """
     places = np.array([camera.position for camera in cameras])
     places /= np.maximum(np.linalg.norm(places, axis=1), 1e-12)[:, None]
     near = np.exp((places @ places.T - 1) / NEAR)
     seen = np.random.default_rng(seed).random(len(cameras)) * LITTLE
-    wrong, taken = np.full(len(cameras), np.nan), 0
     while True:
-        left, mean = np.ones(len(cameras), bool), wrong.mean()
-        ahead = wrong / mean - 1 if mean > 0 else np.zeros(len(cameras))
+        left = np.ones(len(cameras), bool)
         while left.any():
-            view = int(np.argmin(np.where(left, seen - ahead, np.inf)))
+            view = int(np.argmin(np.where(left, seen, np.inf)))
             left[view] = False
             seen = FORGOTTEN * seen + near[view]
             yield view
-            wrong[view] = errors[taken] if taken < len(errors) else np.nan
-            taken += 1
 
 
 def _share(options: OptimizeOptions, steps: int, elapsed: float) -> float:

@@ -67,11 +67,10 @@ class State(ABC):
     @abstractmethod
     def step(
         self, camera: Camera, target: np.ndarray, share: float, speed: float, weight: np.ndarray | None = None
-    ) -> float | None:
+    ) -> None:
         """Step towards a view, ``target`` (h, w, 4); ``share`` in [0, 1] of the run lies behind.
 
-        Rates are multiplied by ``speed``, differences from the view by ``weight`` (h, w). Return the RMS error of the
-        picture before the step; None where it stays on a device.
+        Rates are multiplied by ``speed``, differences from the view by ``weight`` (h, w).
         """
 
     @abstractmethod
@@ -112,14 +111,13 @@ class OnHost(State):
 
     def step(
         self, camera: Camera, target: np.ndarray, share: float, speed: float, weight: np.ndarray | None = None
-    ) -> float | None:
-        """Draw, differentiate the loss, and `descend`; arguments and result as of `State.step`."""
+    ) -> None:
+        """Draw, differentiate the loss, and `descend`; arguments as of `State.step`."""
         projection = self.project(camera, self.options.rule)
         image = blend(projection, np.maximum(self.colors_from(camera), 0), camera.height, camera.width)
         grad, now = picture_slope(image, target, self.options, weight)
         self.error = now if math.isnan(self.error) else MEMORY * self.error + (1 - MEMORY) * now
         self.descend(camera, projection, image, grad, share, speed)
-        return now
 
     def picture(self, camera: Camera, rule: Rule, blocks: Blocks | None = None) -> np.ndarray:
         """Implement `State.picture`."""
