@@ -44,7 +44,7 @@ def require_opengl() -> None:
     if done.returncode:
         raise DataError(
             "the vtk renderer found no off-screen OpenGL; install EGL or OSMesa "
-            "(Debian: libegl1 and libgl1-mesa-dri, or libosmesa6), or use --renderer vvgt"
+            "(Debian: libegl1 and libgl1-mesa-dri, or libosmesa6), or use the vvgt renderer"
         )
 
 
