@@ -1,19 +1,16 @@
 """The pyramid cut by the error of pictures."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from tests.closed_form_scenes import Ramp, scene_of, score
 from tests.test_closed_form_tree import some_tree
 from vvgt_cli.cameras import default_views
-from vvgt_cli.closed_form import VbmOptions, cut_by_error, initialise
+from vvgt_cli.closed_form import VbmOptions, initialise
 from vvgt_cli.closed_form.closed_form import FEW, MAX_FACTOR, MIN_FACTOR, SHARED, UNSEEN, scores_by_error, unseen
 from vvgt_cli.closed_form.fit import blending_weights
 from vvgt_cli.closed_form.tree import select, split_score
 from vvgt_cli.dvr import RenderSettings, render_views
-from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians.rules import INRIA
 from vvgt_cli.volume import shapes
 
@@ -85,12 +82,12 @@ def test_other_views_are_nearer_after_a_second_cut() -> None:
     start = initialise(scene, VbmOptions(max_gaussians=1500, size=200))
     rule = INRIA.at(0.5)
     cameras, others = default_views("train", 12, size=100), default_views("test", 4, size=200)
-    found = cut_by_error(start, cameras, render_views(scene, cameras, RenderSettings(samples=1)), rule)
+    found = start.form.cut_by_error(
+        start.gaussians, cameras, render_views(scene, cameras, RenderSettings(samples=1)), rule
+    )
     assert len(found) <= 1500
     truth = render_views(scene, others, RenderSettings())
     assert score(found, others, truth) > score(start.gaussians, others, truth) + 0.1
-    with pytest.raises(UsageError, match="without a pyramid"):
-        cut_by_error(replace(start, form=None), cameras, truth, rule)
 
 
 def test_the_least_seen_go_first() -> None:
@@ -107,7 +104,9 @@ def test_hidden_cells_are_left_out_and_others_cut_for_them() -> None:
     scene = scene_of(shapes.volume_of(ball, "rough ball"), Ramp(k=4.0))
     start = initialise(scene, VbmOptions(max_gaussians=3000, size=200))
     rule, cameras = INRIA.at(0.5), default_views("train", 12, size=100)
-    found = cut_by_error(start, cameras, render_views(scene, cameras, RenderSettings(samples=1)), rule)
+    found = start.form.cut_by_error(
+        start.gaussians, cameras, render_views(scene, cameras, RenderSettings(samples=1)), rule
+    )
 
     def hidden(weights: np.ndarray) -> float:
         return float((weights < UNSEEN * weights.mean()).mean())
@@ -125,5 +124,7 @@ def test_where_nearly_all_is_seen_all_cells_stay(monkeypatch) -> None:
     weights = blending_weights(start.gaussians, cameras, rule)
     assert 0 < (weights < UNSEEN * weights.mean()).mean() < FEW
     monkeypatch.setattr("vvgt_cli.closed_form.closed_form.blending_weights", None)  # none is looked for
-    found = cut_by_error(start, cameras, render_views(scene, cameras, RenderSettings(samples=1)), rule)
+    found = start.form.cut_by_error(
+        start.gaussians, cameras, render_views(scene, cameras, RenderSettings(samples=1)), rule
+    )
     assert 1490 < len(found) <= 1500

@@ -9,17 +9,19 @@ from vvgt_cli.conversion.plan import Planner
 from vvgt_cli.conversion.request import FitOptions
 from vvgt_cli.conversion.stages import CellsByError
 
+FORM = "vvgt_cli.closed_form.closed_form.ClosedForm"
+
 
 def test_cells_by_error_are_kept_where_the_check_views_gain_and_dropped_where_they_lose(tmp_path, monkeypatch):
-    def colored(start, cameras, views, rule):
-        return solve_colors(start.gaussians, cameras, views, rule=rule)
+    def colored(form, drawn, cameras, views, rule):
+        return solve_colors(drawn, cameras, views, rule=rule)
 
     fit = FitOptions(200, 48, steps=24)
-    monkeypatch.setattr("vvgt_cli.closed_form.cut_by_error", colored)
+    monkeypatch.setattr(f"{FORM}.cut_by_error", colored)
     stage = next(stage for stage in done(tmp_path, fit).stages if stage.name == "cells by error")
     assert stage.kept
     assert stage.psnr > stage.psnr_before
-    monkeypatch.setattr("vvgt_cli.closed_form.cut_by_error", lambda start, *_: darkened(start.gaussians))
+    monkeypatch.setattr(f"{FORM}.cut_by_error", lambda form, drawn, *_: darkened(drawn))
     stages = done(tmp_path, fit, overwrite=True).stages
     stage = next(stage for stage in stages if stage.name == "cells by error")
     assert not stage.kept
@@ -32,12 +34,12 @@ def test_cells_are_chosen_by_views_from_all_sides(tmp_path, monkeypatch):
     """Of 120 views of a spiral, every fifth would stand in bands with holes of 67 degrees."""
     used = []
 
-    def seen(start, cameras, views, rule):
+    def seen(form, drawn, cameras, views, rule):
         used.extend(cameras)
         assert len(views) == len(cameras)
-        return start.gaussians
+        return drawn
 
-    monkeypatch.setattr("vvgt_cli.closed_form.cut_by_error", seen)
+    monkeypatch.setattr(f"{FORM}.cut_by_error", seen)
     monkeypatch.setattr("vvgt_cli.conversion.stages.refinement.refine", lambda run, start, *_: start)
     done(tmp_path, FitOptions(60, 16, steps=200))
     eyes = np.array([camera.position for camera in used])

@@ -67,7 +67,7 @@ def test_a_conversion_resumes_where_it_was_ended(target, calls, left, folder, vv
         ended(patch, "states.step", 20 if "refinement.npz" in left else 24)
         if "cells.npz" in left:
             patch.setattr("vvgt_cli.closed_form.initialise", None)
-            patch.setattr("vvgt_cli.closed_form.cut_by_error", None)
+            patch.setattr("vvgt_cli.closed_form.closed_form.ClosedForm.cut_by_error", None)
         result = vvgt(*line)
     assert result.code == 0, result.err
     assert (folder / "a.ply").read_bytes() == (folder / "whole.ply").read_bytes()

@@ -80,6 +80,15 @@ def test_a_ply_keeps_labels_in_a_byte_and_names_in_its_header(tmp_path: Path) ->
     long = tuple(replace(label, name="\u97f3" * 200) for label in many)
     write_ply(tmp_path / "e.ply", last, PlyOptions(live=facts(long)))
     assert read_columns(tmp_path / "e.ply").comments == read_ply(tmp_path / "e.ply")[1].comments
+    longest = tuple(replace(label, name="\U0001f9e0" * 300) for label in many)
+    refused(
+        vvgt_library.DataError,
+        "shorten the names",
+        write_ply,
+        tmp_path / "f.ply",
+        last,
+        PlyOptions(live=facts(longest)),
+    )
     whole = (tmp_path / "a.ply").read_bytes()
     (tmp_path / "c.ply").write_bytes(whole.replace(b"live label 300", b"live labex 300", 1))
     refused(vvgt_library.DataError, "expected one that vvgt writes", read_ply, tmp_path / "c.ply")

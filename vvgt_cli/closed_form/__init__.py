@@ -98,23 +98,6 @@ def start_of(form: ClosedForm, options: VbmOptions) -> Start:
     return Start(gaussians, kept)
 
 
-def cut_by_error(start: Start, cameras: Sequence[Camera], views: np.ndarray, rule: Rule = INRIA) -> Gaussians:
-    """Return as many Gaussians from other cells of the pyramid: more where views of the first ones are wrong.
-
-    Args:
-        start: from `initialise`, with a pyramid.
-        cameras: of the training views.
-        views: (n, h, w, 4) float32 premultiplied.
-        rule: by which they are drawn.
-
-    Raises:
-        UsageError: there is no pyramid.
-    """
-    if start.form is None:
-        raise UsageError("Gaussians without a pyramid; expected those of `initialise` by moments, as they came from it")
-    return start.form.cut_by_error(start.gaussians, cameras, views, rule)
-
-
 def backproject(
     start: Start, cameras: Sequence[Camera], views: np.ndarray, progress: ProgressCallback | None = None,
     rule: Rule = INRIA,
@@ -139,4 +122,4 @@ def backproject(
     return fit(start.form, cameras, views, progress, rule)
 
 
-__all__ = ["METHODS", "Start", "VbmOptions", "backproject", "cut_by_error", "initialise"]
+__all__ = ["METHODS", "Start", "VbmOptions", "backproject", "initialise"]

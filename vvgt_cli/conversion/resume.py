@@ -7,22 +7,18 @@ was never interrupted.
 from __future__ import annotations
 
 import json
-import struct
-import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.digests import digest
-from vvgt_cli.files import atomic_write, claim, read_text
+from vvgt_cli.files import claim, read_text
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.network.card import CARD, find_model
-from vvgt_cli.refine.checkpoint import load_archive
+from vvgt_cli.refine.checkpoint import FAULTS, load_archive, save_archive
 from vvgt_cli.version import VERSION
 
 if TYPE_CHECKING:
@@ -31,10 +27,6 @@ if TYPE_CHECKING:
 
 CLOSED_FORM, CELLS, FITTED = "closed-form.npz", "cells.npz", "fitted.npz"
 DESCENT = "refinement.npz"  # written by `vvgt_cli.refine.checkpoint`
-_FAULTS = (
-    *(OSError, KeyError, ValueError, TypeError, AttributeError, EOFError, MemoryError, RuntimeError, DataError),
-    *(zipfile.BadZipFile, struct.error),
-)
 
 
 @dataclass(frozen=True)
@@ -67,7 +59,7 @@ class Checkpoint:
             about, arrays = load_archive(str(path))
             key, beside = str(about["key"]), dict(about["beside"])
             gaussians = Gaussians(**arrays)
-        except _FAULTS as error:
+        except (DataError, *FAULTS) as error:
             text = " ".join(str(error).split())[:200]
             raise DataError(f"{path}: not a checkpoint of 'vvgt convert' ({text}); remove it") from None
         if key != self.key:
@@ -78,10 +70,7 @@ class Checkpoint:
         """Save the result of a stage, or raise DataError."""
         if self.folder is None:
             return
-        arrays: dict[str, Any] = gaussians.arrays()
-        about = np.array(json.dumps({"key": self.key, "beside": beside}))
-        with atomic_write(self.folder / name, overwrite=True) as temporary, open(temporary, "wb") as stream:
-            np.savez(stream, about=about, **arrays)
+        save_archive(self.folder / name, {"key": self.key, "beside": beside}, gaussians.arrays())
 
     def finish(self) -> None:
         """Remove all files, once the output is written."""

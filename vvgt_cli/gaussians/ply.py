@@ -177,13 +177,22 @@ def _numbers(facts: LiveFacts) -> list[tuple[str, str, str, int]]:
 
 
 def ply_header(count: int, degree: int, options: PlyOptions, live: bool = False) -> bytes:
-    """Return the header of a file of ``count`` Gaussians with harmonics of ``degree``; ``live`` adds carried values."""
+    """Return the header of a file of ``count`` Gaussians with harmonics of ``degree``; ``live`` adds carried values.
+
+    Raise DataError for names and functions that make it longer than readers accept.
+    """
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]  # some loaders count lines
     lines += [f"property float {name}" for name in property_names(degree, live)]
     if live and options.live is not None:
         lines += [f"property {kind} {name}" for name, kind, _, _ in _numbers(options.live)]
     lines += [*(comment_lines(options) if options.comments else []), "end_header", ""]
-    return "\n".join(lines).encode("ascii")
+    content = "\n".join(lines).encode("ascii")
+    if len(content) > MAX_BYTES:
+        raise DataError(
+            f"the header takes {len(content)} bytes with names and functions; expected at most {MAX_BYTES}; shorten "
+            "the names of labels or layers"
+        )
+    return content
 
 
 def _rows(source: str | Path | BinaryIO, name: str) -> tuple[PlyHeader, np.ndarray]:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 GAIN = 0.01  # dB: less is none
 FALLEN = 3.0  # dB below the best: rates were too large
 
-_FAULTS = (
+FAULTS = (  # that reading a damaged archive raises
     *(OSError, KeyError, ValueError, TypeError, AttributeError, OverflowError, EOFError, MemoryError, RuntimeError),
     *(zipfile.BadZipFile, struct.error),
 )
@@ -108,8 +108,7 @@ def save(path: str, key: str, state: State, checks: Checks, record: OptimizeReco
     arrays: dict[str, Any] = {f"state_{name}": array for name, array in state.saved().items()}
     arrays |= {f"best_{name}": array for name, array in (checks.kept or {}).items()}
     about = {"key": key, "walk": walk, "best": checks.best, "idle": checks.idle, "record": asdict(record)}
-    with atomic_write(path, overwrite=True) as temporary, open(temporary, "wb") as stream:
-        np.savez(stream, about=np.array(json.dumps(about)), **arrays)
+    save_archive(path, about, arrays)
 
 
 def resume(path: str, key: str, state: State, checks: Checks, record: OptimizeRecord) -> dict[str, Any] | None:
@@ -135,13 +134,19 @@ def resume(path: str, key: str, state: State, checks: Checks, record: OptimizeRe
         best, idle, walk = about["best"], int(about["idle"]), dict(about["walk"])
         described = {field: about["record"][field] for field in asdict(record)}
         described["checks"] = [tuple(look) for look in described["checks"]]
-    except _FAULTS as error:
+    except FAULTS as error:
         text = " ".join(str(error).split())[:200]
         raise DataError(f"{path}: not a checkpoint of gradient descent ({text}); remove it to start afresh") from None
     checks.best, checks.idle, checks.kept = best, idle, kept or None
     for field, value in described.items():
         setattr(record, field, value)
     return walk
+
+
+def save_archive(path: str | Path, about: dict[str, Any], arrays: dict[str, Any]) -> None:
+    """Write arrays and a description of plain values to an .npz, in place of one at ``path``, or raise DataError."""
+    with atomic_write(path, overwrite=True) as temporary, open(temporary, "wb") as stream:
+        np.savez(stream, about=np.array(json.dumps(about)), **arrays)
 
 
 def load_archive(path: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

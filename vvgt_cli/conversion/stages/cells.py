@@ -38,11 +38,8 @@ class CellsByError(Stage):
 
     def run(self, work: Work) -> None:
         """Cut the pyramid, or load the result from the checkpoint."""
-        from vvgt_cli.closed_form import cut_by_error
-
         assert work.train is not None
         assert work.train_rule is not None
-        assert work.start is not None
         run, train = work.run, work.train
         kept = work.checkpoint.load(CELLS) if self.keep else None
         if kept:
@@ -50,10 +47,12 @@ class CellsByError(Stage):
                 stage.note = f"{len(kept[0])} Gaussians, from {work.checkpoint.folder}"
             work.gaussians = kept[0]
             return
+        assert work.start is not None
+        assert work.start.form is not None
         with run.stage(self.name) as stage:
             chosen = farthest_cameras(train.cameras, VIEWS)  # every fourth or fifth view would lie in bands
             cameras = [train.cameras[i] for i in chosen]
-            recut = cut_by_error(work.start, cameras, train.images[chosen], work.train_rule)
+            recut = work.start.form.cut_by_error(work.start.gaussians, cameras, train.images[chosen], work.train_rule)
             work.keep_better(stage, recut, f"{len(recut)} Gaussians, by {len(chosen)} views")
         if self.keep:
             work.checkpoint.save(CELLS, work.current())
