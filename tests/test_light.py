@@ -10,10 +10,10 @@ from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.closed_form.columns import COLUMNS, X, Z
 from vvgt_cli.closed_form.lit import FIXED, SUMS, _shade, point_normals
 from vvgt_cli.dvr import RenderSettings, Scene, render_view, render_view_reference
-from vvgt_cli.dvr.backends import view_renderer
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.dvr.light import sphere
 from vvgt_cli.dvr.reference import normals, trilinear
+from vvgt_cli.dvr.vtk import view_renderer
 from vvgt_cli.errors import UsageError
 from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.lighting import Lighting, LightOptions, parse_lighting
@@ -211,4 +211,4 @@ def test_other_lines_are_refused(text):
 
 def test_renderers_say_which_light_they_do_not_know():
     with pytest.raises(UsageError, match="no skies"):
-        view_renderer("vtk", blob().lit(LightOptions(("sun",)).lighting(None, None)))
+        view_renderer(blob().lit(LightOptions(("sun",)).lighting(None, None)))

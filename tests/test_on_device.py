@@ -9,7 +9,7 @@ import pytest
 
 from tests import simulated_gpu
 from tests.processes import python
-from tests.test_dvr_backends import scene, view
+from tests.test_dvr_renderer_vtk import scene, view
 from vvgt_cli import device
 from vvgt_cli.cameras import default_views
 from vvgt_cli.device import on_device

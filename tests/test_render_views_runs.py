@@ -75,13 +75,13 @@ def test_a_run_that_is_killed_goes_on(vvgt, tmp_path, made, monkeypatch):
 
 
 def test_a_renderer_that_is_not_there_leaves_nothing(vvgt, tmp_path, monkeypatch):
-    from vvgt_cli.dvr import backends
+    from vvgt_cli.dvr import vtk
 
-    def refuse(renderer, scene, settings):
-        raise DataError(f"no device for {renderer}")
+    def refuse(scene, settings):
+        raise DataError("no device here")
 
-    monkeypatch.setattr(backends, "view_renderer", refuse)
-    assert "no device for vtk" in vvgt(*BASE, "--renderer", "vtk", "-o", tmp_path / "v").error
+    monkeypatch.setattr(vtk, "view_renderer", refuse)
+    assert "no device here" in vvgt(*BASE, "--renderer", "vtk", "-o", tmp_path / "v").error
     assert not (tmp_path / "v").exists()
 
 

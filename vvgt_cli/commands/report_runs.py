@@ -145,10 +145,10 @@ class Reference:
         conditions = list(condition_views(volume.views, around, REFERENCE))
         return cls(views, size, volume.source.volume.axes, conditions)
 
-    def psnr_of(self, renderer: str, field: Field) -> float | None:
-        """Return another renderer's mean PSNR on the views that are drawn whole, None if it cannot draw them."""
+    def vtk_psnr(self, field: Field) -> float | None:
+        """Return the mean PSNR of VTK's pictures in the views that are drawn whole, None if it cannot draw them."""
         from vvgt_cli.dvr import REFERENCE
-        from vvgt_cli.dvr.backends import view_renderer
+        from vvgt_cli.dvr.vtk import view_renderer
         from vvgt_cli.images.metrics import score_view
         from vvgt_cli.volume.vtk.messages import quiet_vtk
 
@@ -157,7 +157,7 @@ class Reference:
         cameras = [default_views("test", size=self.size)[n] for n in WHOLE]
         try:
             with quiet_vtk():  # which says where it looked for a screen
-                draw = view_renderer(renderer, field.scene)
+                draw = view_renderer(field.scene)
                 pairs = [(self.views.view(camera, REFERENCE), draw(camera)) for camera in cameras]
         except (DataError, UsageError):
             return None
@@ -327,7 +327,7 @@ def report_on(
         live = live_refusal(replace(alone, live=True), scene) is None
         warm_up(alone, fit, steps, live)
         reference = Reference.render(volume, size, console)
-        ceiling = reference.psnr_of("vtk", volume)
+        ceiling = reference.vtk_psnr(volume)
         shown = reference.pictures(lambda camera: reference.views.view(camera, REFERENCE), picture_size)
     runs, ours, planned = [], [], plan_runs(fit, steps, peers, live)
     for run, gaussians in do_runs(alone, planned, reference):

@@ -281,7 +281,9 @@ class Rays:
     device: str = "cpu"
 
     def __post_init__(self) -> None:
-        """Raise UsageError for samples that VTK has not."""
+        """Raise UsageError for an unknown renderer, or samples that VTK has not."""
+        if self.renderer not in ("vvgt", "vtk"):
+            raise UsageError(f"--renderer {self.renderer}: expected vvgt or vtk")
         if self.renderer == "vtk" and self.samples not in ("adaptive", 1):
             raise UsageError(f"--samples {self.samples}: VTK casts one ray per pixel; omit it")
 
@@ -335,11 +337,12 @@ def open_looks(
 def prepare(field: Field, rays: Rays, cameras: Sequence[Camera]) -> Draw:
     """Return what draws a view of ``cameras``."""
     from vvgt_cli.dvr import RenderSettings
-    from vvgt_cli.dvr.backends import view_renderer
 
     settings = RenderSettings(rays.step, None if rays.samples == "adaptive" else int(rays.samples))
-    if rays.renderer != "vvgt" and isinstance(field, Resident) and cameras:
-        return render_in_box(view_renderer(rays.renderer, field.scene, settings), field.source.volume.axes)
+    if rays.renderer == "vtk" and isinstance(field, Resident) and cameras:
+        from vvgt_cli.dvr import vtk
+
+        return render_in_box(vtk.view_renderer(field.scene, settings), field.source.volume.axes)
     return draw_views(field, settings, cameras)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from vvgt_cli.cameras import Camera
 from vvgt_cli.dvr.render import RenderSettings
 from vvgt_cli.dvr.scene import Scene
-from vvgt_cli.errors import DataError
+from vvgt_cli.errors import DataError, UsageError
 
 NODES = 4096  # of the functions handed to VTK: it tabulates them anyway
 REFLECTED = 0.25  # of the power: of the angle to the reflected ray, twice that to the half vector
@@ -48,7 +48,9 @@ def require_opengl() -> None:
         )
 
 
-def view_renderer(scene: Scene, settings: RenderSettings, mended: bool = False) -> Callable[[Camera], np.ndarray]:
+def view_renderer(
+    scene: Scene, settings: RenderSettings | None = None, mended: bool = False
+) -> Callable[[Camera], np.ndarray]:
     """Return a function from a camera to VTK's view, (height, width, 4) float32, premultiplied in steps of 1/255.
 
     One ray a pixel at ``settings.step`` voxels of the mean edge. The volume is padded by its edge voxels and cropped to
@@ -56,10 +58,16 @@ def view_renderer(scene: Scene, settings: RenderSettings, mended: bool = False) 
     stretching them, which VTK does under lights from directions where the box is no cube (docs/light.md).
 
     Raises:
+        UsageError: the scene is a label map, layers or colours, or under a sky.
         DataError: no off-screen OpenGL here.
     """
     import importlib
 
+    if scene.grid is not None:
+        raise UsageError(f"the vtk renderer draws one volume under a function; of {scene.tf.name} try vvgt")
+    if scene.light is not None and scene.light.traced:
+        raise UsageError("the vtk renderer has no skies; use the vvgt renderer")
+    settings = settings or RenderSettings()
     require_opengl()
     for name in MODULES:
         importlib.import_module(f"vtkmodules.{name}")

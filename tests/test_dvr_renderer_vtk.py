@@ -1,15 +1,15 @@
-"""Renderers behind one switch: VTK against the kernel, errors of one line."""
+"""VTK's renderer against the ray caster, and errors of one line."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+import vvgt_cli as vvgt
 from tests.vtk_views import drawn_by_vtk
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.dvr import RenderSettings, Scene, render_views
 from vvgt_cli.dvr import vtk as vtk_renderer
-from vvgt_cli.dvr.backends import view_renderer
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.volume import Volume
@@ -32,21 +32,15 @@ def view(width=40, height=32, eye=(2.2, -1.6, 1.1)):
     return look_at(eye, width=width, height=height, fov=40)
 
 
-def test_the_kernel_is_our_renderer():
-    made, cameras = scene(), [view(), view(eye=(0, 3, 1))]
-    images = list(map(view_renderer("vvgt", made, FINE), cameras))
-    assert np.stack(images).tobytes() == render_views(made, cameras, FINE).tobytes()
-
-
-def test_what_a_renderer_cannot_do_is_said_in_one_line():
-    with pytest.raises(UsageError, match=r"renderer 'gpu'; expected one of vvgt, vtk"):
-        view_renderer("gpu", scene())(view())
+def test_an_unknown_renderer_is_refused():
+    with pytest.raises(UsageError, match="--renderer gpu: expected vvgt or vtk"):
+        vvgt.render_views("example:blob:8", renderer="gpu")
 
 
 def test_a_machine_without_opengl_is_told_so(monkeypatch):
     monkeypatch.setattr(vtk_renderer, "PROBE", "raise SystemExit(3)")
     with pytest.raises(DataError, match="no off-screen OpenGL; install EGL or OSMesa"):
-        view_renderer("vtk", scene())(view())
+        vtk_renderer.view_renderer(scene())
 
 
 def test_the_padding_of_vtks_image_lies_around_it():
@@ -58,10 +52,10 @@ def test_the_padding_of_vtks_image_lies_around_it():
 VTK_VIEWS = """
 import sys
 import numpy as np
-from tests.test_dvr_backends import FINE, decentred, scene, view
-from vvgt_cli.dvr.backends import view_renderer
+from tests.test_dvr_renderer_vtk import FINE, decentred, scene, view
+from vvgt_cli.dvr.vtk import view_renderer
 from vvgt_cli.look.lighting import Lighting
-draw, lit = (view_renderer("vtk", made, FINE) for made in (scene(), scene().lit(Lighting())))
+draw, lit = (view_renderer(made, FINE) for made in (scene(), scene().lit(Lighting())))
 np.savez(sys.argv[1], plain=draw(view()), decentred=draw(decentred()), lit=lit(view()))
 """
 
