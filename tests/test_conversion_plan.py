@@ -10,7 +10,7 @@ from test_cli_infer import DARKER
 
 from tests.refused import refused
 from vvgt_cli.cameras.blocks import BLOCK, ENOUGH, FEW, spread_blocks
-from vvgt_cli.conversion.convert import convert
+from vvgt_cli.conversion.convert import convert_one
 from vvgt_cli.conversion.fitting import plan_of
 from vvgt_cli.conversion.plan import Planner, check_memory
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
@@ -64,7 +64,7 @@ def drawn(size, enough):
 
 
 def done(tmp_path, fit=SMALL, **options):
-    return convert(ConvertRequest(SOURCE, str(tmp_path / "a.ply"), fit, **options), Console(quiet=True)).report
+    return convert_one(ConvertRequest(SOURCE, str(tmp_path / "a.ply"), fit, **options), Console(quiet=True)).report
 
 
 def chosen(report):
@@ -179,7 +179,7 @@ def test_no_steps_leave_back_projection():
 
 def test_back_projection_is_kept_where_the_check_views_gain_and_dropped_where_they_lose(tmp_path, monkeypatch):
     fit = FitOptions(200, 48, steps=0)
-    convert(ConvertRequest(SOURCE, str(tmp_path / "init.ply"), fit, scored=False), Console(quiet=True))
+    convert_one(ConvertRequest(SOURCE, str(tmp_path / "init.ply"), fit, scored=False), Console(quiet=True))
     alone = read_ply(tmp_path / "init.ply")[0]
     stage = next(stage for stage in done(tmp_path, fit).stages if stage.name == "back-projection")
     assert stage.kept

@@ -9,7 +9,7 @@ from vvgt_cli.gaussians.frames import rotations
 from vvgt_cli.network.config import SLOPES
 from vvgt_cli.network.prepare import STEP, pack, slope_rows, unpack
 from vvgt_cli.splat import project, render, render_reference
-from vvgt_cli.splat.render import moments, step_slopes
+from vvgt_cli.splat.render import pair_sums, step_slopes
 
 
 def stepped(g, step):
@@ -32,7 +32,7 @@ def test_gradients_in_the_own_frame_against_differences(columns):
     gaussians, cameras, _ = scene(count=12, views=1, seed=4)
     gaussians = unpack(pack(gaussians))
     slope, projection = np.random.default_rng(0).normal(size=(32, 32, 4)), project(gaussians, cameras[0])
-    pairs = moments(projection, gaussians.colors, render(gaussians, cameras[0]), slope)
+    pairs = pair_sums(projection, gaussians.colors, render(gaussians, cameras[0]), slope)
     found = step_slopes(gaussians, cameras[0], projection, pairs, gaussians.colors)
     assert found.shape == (12, STEP)
     step = np.zeros((12, STEP))

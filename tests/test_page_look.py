@@ -19,7 +19,7 @@ from vvgt_cli.gaussians import PlyOptions
 from vvgt_cli.gaussians.formats.page_file import upright
 from vvgt_cli.gaussians.formats.page_look import html, nodes_of
 from vvgt_cli.gaussians.formats.page_presets import Sketch, kind_of, presets_of
-from vvgt_cli.gaussians.formats.page_values import Layer, values_of
+from vvgt_cli.gaussians.formats.page_values import PageLayer, values_of
 from vvgt_cli.gaussians.formats.splats import splats_of
 from vvgt_cli.gaussians.frames import up_matrix
 from vvgt_cli.gaussians.live_facts import LiveFacts, function_text
@@ -34,7 +34,7 @@ LAB = TransferFunction("lab", RAMP.opacity_nodes, ColorMap(COLORS.x, COLORS.rgb,
 
 def page_of(known: LiveFacts | None, options: PlyOptions, name: str = "a.html") -> tuple[bytes, dict[str, Any]]:
     """The page of a volume under a look, and the scene that it holds."""
-    held = values_of([Layer(Volume(np.zeros((2, 3, 4), np.uint8)), RAMP, 0.5)])
+    held = values_of([PageLayer(Volume(np.zeros((2, 3, 4), np.uint8)), RAMP, 0.5)])
     assert held is not None
     values = None if known is None else held._replace(look=known)
     content = html(splats_of(replace(cloud(), live=None), upright(options)), name, values, options)

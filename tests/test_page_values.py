@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from vvgt_cli.field.source import SourceRequest, load
-from vvgt_cli.gaussians.formats.page_values import Layer, Values, packed, values_of
+from vvgt_cli.gaussians.formats.page_values import PageLayer, Values, packed, values_of
 from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.labels import Label, LabelTable
 from vvgt_cli.volume import Volume, averaged
@@ -40,7 +40,7 @@ def unpacked(content: bytes, facts: dict[str, Any]) -> np.ndarray:
 
 def grids_of(volume: Volume, look: TransferFunction | LabelTable = SHOWN) -> Values:
     """The grid of a volume."""
-    found = values_of([Layer(volume, look, 1.0)])
+    found = values_of([PageLayer(volume, look, 1.0)])
     assert found is not None
     return found
 

@@ -15,7 +15,7 @@ from tests.random_clouds import random_cloud
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.blocks import BLOCK
 from vvgt_cli.conversion.changes import EDGE, REACH, Changes, changes
-from vvgt_cli.conversion.convert import convert
+from vvgt_cli.conversion.convert import convert_one
 from vvgt_cli.conversion.previous_frame import PreviousFrame, RememberedViews
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.dvr import RenderSettings
@@ -276,7 +276,7 @@ def test_what_frames_leave_to_later_ones_is_in_the_memory_that_is_asked_for(beat
     for k in (0, 1, 2, 0):
         source = SourceRequest(str(beat / f"v_{k}.npy"), tf=str(beat / "tf.json"))
         request = ConvertRequest(source=source, fit=FitOptions(400, 96, steps=100), output=str(beat / f"{k}.ply"))
-        convert(replace(request, overwrite=True), start=start)
+        convert_one(replace(request, overwrite=True), start=start)
     turns = len(start._last.shown)
     assert turns > 3
     pictures = sum(picture.nbytes for _, picture, _ in start._pictures._kept.values())

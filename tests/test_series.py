@@ -19,7 +19,7 @@ from tests.headers import uncertified
 from tests.processes import replaced
 from tests.test_streamed import contents as files_in
 from vvgt_cli.commands import main
-from vvgt_cli.conversion.convert import convert
+from vvgt_cli.conversion.convert import convert_one
 from vvgt_cli.conversion.frames import merge_statistics
 from vvgt_cli.conversion.index import FRAMES, FUNCTIONS, LABELS, frame_facts, is_pattern, put_name
 from vvgt_cli.errors import UsageError
@@ -52,7 +52,7 @@ def stand_in(monkeypatch: pytest.MonkeyPatch) -> list:
 
     def write(request, console, finished=None, start=None) -> SimpleNamespace:
         if request.output is None:
-            return convert(request, console, start=start, finished=finished)
+            return convert_one(request, console, start=start, finished=finished)
         calls.append(request)
         source = load(request.source)
         text = f"{source.tf.node_range()} {source.statistics.hi:g} {request.fit}"
@@ -60,7 +60,7 @@ def stand_in(monkeypatch: pytest.MonkeyPatch) -> list:
             Path(name).write_text(text)
         return SimpleNamespace(report=ConversionReport("convert"))
 
-    monkeypatch.setattr("vvgt_cli.conversion.convert_batch.convert", write)
+    monkeypatch.setattr("vvgt_cli.conversion.convert_batch.convert_one", write)
     return calls
 
 
@@ -199,7 +199,7 @@ def test_an_interrupted_frame_is_not_recorded(vvgt, series: Path, monkeypatch: p
         Path(request.output).write_text("short")
         return SimpleNamespace(report=ConversionReport("convert", refinement={"reason": "interrupted"}))
 
-    monkeypatch.setattr("vvgt_cli.conversion.convert_batch.convert", interrupted)
+    monkeypatch.setattr("vvgt_cli.conversion.convert_batch.convert_one", interrupted)
     run = ("convert", series / "run_*.npy", "--tf", series / "tf.json", "-o", series / "out" / "{:02d}.ply", *SMALL)
     assert vvgt(*run).code == 130
     assert "01.ply" not in (series / "out" / "manifest.json").read_text().split('"files"')[1]

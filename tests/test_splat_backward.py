@@ -14,7 +14,7 @@ from vvgt_cli.gaussians.frames import rotations
 from vvgt_cli.gaussians.rules import INRIA, RULES
 from vvgt_cli.splat import project, render, render_backward, render_reference
 from vvgt_cli.splat.reference import covariances, layers
-from vvgt_cli.splat.render import moments, own_axes_backward, project_factors
+from vvgt_cli.splat.render import own_axes_backward, pair_sums, project_factors
 
 FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "colors")
 EYE = (2.0, -1.7, 1.1)
@@ -192,7 +192,7 @@ def test_own_axes_gradients_match_the_twin(axes, rule):
     np.testing.assert_allclose(factors @ factors.transpose(0, 2, 1), covariances(g), atol=1e-7)
     grad = np.random.default_rng(0).normal(size=(c.height, c.width, 4)).astype(np.float32)
     p = project_factors(g.means, factors, g.opacity_logits, c, rule)
-    pairs = moments(p, g.colors, render(g, c, projection=p), grad)
+    pairs = pair_sums(p, g.colors, render(g, c, projection=p), grad)
     ours, _ = own_axes_backward(g.means, factors, g.colors, c, p, pairs)
     centres, inverses, logits, colors = image_gradients(g, c, grad.astype(np.float64), rule)
     means, spatial = space_gradients(g, c, centres, inverses, rule)

@@ -12,7 +12,7 @@ from vvgt_cli.gaussians.frames import rotations, view_colors
 from vvgt_cli.gaussians.types import HARMONICS
 from vvgt_cli.splat import project, render, render_backward, render_reference
 from vvgt_cli.splat.reference import layers
-from vvgt_cli.splat.render import moments, own_axes_backward, project_factors, seen_colors, seen_slopes
+from vvgt_cli.splat.render import own_axes_backward, pair_sums, project_factors, seen_colors, seen_slopes
 
 EYE = (2.0, -1.7, 1.1)
 DEGREES = (1, 2, 3)
@@ -118,7 +118,7 @@ def test_own_axes_gradients_match_the_twin():
     grad = np.random.default_rng(0).normal(size=(c.height, c.width, 4)).astype(np.float32)
     p = project_factors(g.means, factors, g.opacity_logits, c)
     seen = seen_colors(g.means, g.colors, g.harmonics, c.position)
-    pairs = moments(p, seen, render(g, c, projection=p), grad)
+    pairs = pair_sums(p, seen, render(g, c, projection=p), grad)
     rows, harmonics = own_axes_backward(g.means, factors, seen, c, p, pairs, g.harmonics)
     twin = render_backward_reference(g, c, grad.astype(np.float64))
     steps = np.einsum("kji,kj->ki", factors, twin["means"])

@@ -11,13 +11,13 @@ import pytest
 
 from tests.test_live import RAMP
 from vvgt_cli.errors import DataError
-from vvgt_cli.gaussians.formats.page_values import Layer
+from vvgt_cli.gaussians.formats.page_values import PageLayer
 from vvgt_cli.gaussians.story import KEYS, LONG, MOST, read_story
 from vvgt_cli.look.labels import Label, LabelTable
 from vvgt_cli.volume import Volume
 
 HOW = ("--max-gaussians", "60", "--screen", "32", "--steps", "0")
-VALUES = Layer(Volume(np.zeros((4, 4, 4), np.uint8), spacing=(2.0, 2.0, 2.0), origin=(10.0, 0.0, 0.0)), RAMP, 0.5)
+VALUES = PageLayer(Volume(np.zeros((4, 4, 4), np.uint8), spacing=(2.0, 2.0, 2.0), origin=(10.0, 0.0, 0.0)), RAMP, 0.5)
 TABLE = LabelTable("t", (Label(1, "liver", (1.0, 0.0, 0.0), 1.0), Label(7, "spleen", (0.0, 0.0, 1.0), 1.0)))
 LABELS = VALUES._replace(look=TABLE)
 POINTS = [{"x": 0, "opacity": 0, "rgb": [0, 0, 0]}, {"x": 1, "opacity": 1, "rgb": [1, 1, 1]}]

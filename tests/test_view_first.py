@@ -25,7 +25,7 @@ def test_too_many_labels_are_converted_first(monkeypatch: pytest.MonkeyPatch) ->
         unscored("conversion")
         return SimpleNamespace(scores={"psnr": 40.0})
 
-    monkeypatch.setattr(converter_process, "convert", conversion)
+    monkeypatch.setattr(converter_process, "convert_one", conversion)
     monkeypatch.setattr(converter_process, "_file", lambda found: b"scored")
     monkeypatch.setattr(converter_process.LoadedVolume, "_with_page", lambda volume, found: Converted(b"", {}))
     messages: list[Message] = []

@@ -35,7 +35,7 @@ from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import PlyOptions, as_ply, read_ply, write_ply
 from vvgt_cli.gaussians.formats.page_file import read_html
 from vvgt_cli.gaussians.formats.page_look import look_entry, parse_light
-from vvgt_cli.gaussians.formats.page_values import Layer, values_of
+from vvgt_cli.gaussians.formats.page_values import PageLayer, values_of
 from vvgt_cli.gaussians.frames import up_matrix
 from vvgt_cli.gaussians.live import Table, baked
 from vvgt_cli.look.lighting import Lighting
@@ -221,7 +221,7 @@ def controller(tmp_path: Path) -> Iterator[tuple[str, PageController]]:
 
     site = Site({}, print)
     found = PageController(site.resources, site.posts, "x", Console(quiet=True))
-    values = values_of([Layer(Volume(np.zeros((2, 3, 4), np.uint8)), RAMP, 0.5)])
+    values = values_of([PageLayer(Volume(np.zeros((2, 3, 4), np.uint8)), RAMP, 0.5)])
     assert values is not None
     values = values._replace(look=replace(facts(), distance=0.5))
     ply = as_ply(hidden((1, 1, 1)), PlyOptions(up="y", scale=0.1, unit_distance=0.5))

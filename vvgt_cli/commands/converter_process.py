@@ -18,7 +18,7 @@ import numpy as np
 
 from vvgt_cli.commands.converter import ConsoleLine, Converted, Failed, Job, Message, Progress, Scored
 from vvgt_cli.commands.live_site import cloud_of, page_files, stored
-from vvgt_cli.conversion.convert import convert
+from vvgt_cli.conversion.convert import convert_one
 from vvgt_cli.conversion.opened import open_field, ply_options
 from vvgt_cli.conversion.previous_look import PreviousLook
 from vvgt_cli.conversion.request import ConvertRequest
@@ -109,7 +109,7 @@ class LoadedVolume:
         self, request: ConvertRequest, console: MessageConsole, message: Callable[[Conversion], Converted]
     ) -> Conversion:
         """Convert; send ``message(conversion)`` before the scores are known, then the scores."""
-        conversion = convert(
+        conversion = convert_one(
             request, console, start=self.last, unscored=lambda unscored: console.send(message(unscored))
         )
         assert conversion.scores is not None

@@ -17,7 +17,7 @@ import numpy as np
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.boxed import render_in_box
 from vvgt_cli.commands.peers import Peer, PeerViews, train
-from vvgt_cli.conversion.convert import convert
+from vvgt_cli.conversion.convert import convert_one
 from vvgt_cli.conversion.live import live_refusal
 from vvgt_cli.conversion.opened import open_field
 from vvgt_cli.conversion.previous_frame import RememberedViews
@@ -188,7 +188,7 @@ def do_runs(
     """Yield each run (a dict, see `vvgt_cli.score.curves`) and its Gaussians, box frame.
 
     Raises:
-        DataError, UsageError: as `vvgt_cli.conversion.convert.convert`.
+        DataError, UsageError: as `vvgt_cli.conversion.convert.convert_one`.
         KeyboardInterrupt: a refinement was interrupted; later runs would not be comparable.
     """
     with tempfile.TemporaryDirectory() as folder:
@@ -223,7 +223,7 @@ def _run(
         return report, transform(gaussians, np.linalg.inv(axes))
     with tempfile.TemporaryDirectory() as folder:
         path = str(Path(folder) / "run.ply")
-        report = convert(
+        report = convert_one(
             replace(request, output=path, fit=planned.fit, up="none", live=planned.kind == "live"), Console(quiet=True)
         ).report
         return report, transform(read_ply(path)[0], np.linalg.inv(axes))

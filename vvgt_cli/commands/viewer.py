@@ -155,7 +155,7 @@ def _only_gaussians(files: Sequence[str]) -> None:
 
 def _opened(run: Run, name: str, request: ConvertRequest) -> tuple[Gaussians, PlyOptions, Values | None]:
     """Return Gaussians in the unit frame, how to write them, and values for a page; a volume is converted."""
-    from vvgt_cli.conversion.convert import convert
+    from vvgt_cli.conversion.convert import convert_one
 
     if name == STDIN or is_splats(name):
         _refuse_reading(request.source, name)
@@ -163,7 +163,7 @@ def _opened(run: Run, name: str, request: ConvertRequest) -> tuple[Gaussians, Pl
         options = layout_of(header)
         story = request.story and request.story.checked(())
         return gaussians, replace(options, title=request.title or options.title, story=story), None
-    conversion = convert(request, run.console)
+    conversion = convert_one(request, run.console)
     return conversion.gaussians, conversion.ply, conversion.values(run) if request.values else None
 
 

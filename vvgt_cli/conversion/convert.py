@@ -33,7 +33,7 @@ from vvgt_cli.score.viewing import PREVIEW_VIEWS
 Unscored = Callable[[Conversion], None]  # is called with a conversion before it has scores and a certificate
 
 
-def convert(
+def convert_one(
     request: ConvertRequest, console: Console | None = None, *, start: WarmStart | None = None,
     finished: Gaussians | None = None, unscored: Unscored | None = None,
 ) -> Conversion:  # fmt: skip
@@ -69,7 +69,7 @@ def convert_field(
     run: Run, request: ConvertRequest, field: Field, start: WarmStart | None = None,
     finished: Gaussians | None = None, unscored: Unscored | None = None,
 ) -> Conversion:  # fmt: skip
-    """Convert a field: closed form, refinement, file, scores on the test views, certificate; see `convert`."""
+    """Convert a field: closed form, refinement, file, scores on the test views, certificate; see `convert_one`."""
     work = work_of(run, request, field)
     scores = fit(work, request, start, finished)
     gaussians = NOTHING  # where they are only on disk

@@ -25,7 +25,7 @@ from vvgt_cli.conversion.batch import (
     options_in,
 )
 from vvgt_cli.conversion.clouds import Cloud, Clouds, write_together
-from vvgt_cli.conversion.convert import convert
+from vvgt_cli.conversion.convert import convert_one
 from vvgt_cli.conversion.fitting import plan_of
 from vvgt_cli.conversion.frames import FrameSeries, is_glob_of_volumes
 from vvgt_cli.conversion.index import (
@@ -220,7 +220,7 @@ def _run(batch: Batch, files: Files | None, console: Console) -> Clouds:
         for item in batch.items(run, lambda stem: files is None or files.wants(batch, stem)):
             alone = replace(item.request, output=None, report=None, preview=None)
             request = alone if files is None else files.request(batch, item)
-            conversion = convert(request, run.console, start=batch.previous, finished=item.gaussians)
+            conversion = convert_one(request, run.console, start=batch.previous, finished=item.gaussians)
             if conversion.report.interrupted:
                 raise KeyboardInterrupt
             facts = {**item.facts, **(batch.previous.facts() if batch.previous else {})}
@@ -289,7 +289,7 @@ def convert_all(
     holds_frames = not output or is_page(output)
     if kind == ONE and not (holds_frames and is_glob_of_volumes(request.source)):
         try:
-            return convert(request, console, start=None if after is None else PreviousLook(after))
+            return convert_one(request, console, start=None if after is None else PreviousLook(after))
         except SeveralSteps:
             if not holds_frames or not isinstance(request.source.volume, str):
                 raise

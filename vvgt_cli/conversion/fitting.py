@@ -75,7 +75,7 @@ def fit(
         finished: finished Gaussians, box frame, that only need scores.
 
     Raises:
-        DataError, UsageError: see `vvgt_cli.conversion.convert.convert`.
+        DataError, UsageError: see `vvgt_cli.conversion.convert.convert_one`.
     """
     run, field = work.run, work.field
     if start is not None:

@@ -239,7 +239,7 @@ def refine_part(part: VolumePart, gaussians: Gaussians, refiner: Refiner, distan
         return gaussians
     screen = pixel_width(refiner.fit.screen) * distance / RADIUS * part.scale
     width = float(np.exp(np.median(np.sort(start.log_scales, axis=1)[:, 1])))
-    edge = view_edge(width, screen)
+    edge = _edge_of_views(width, screen)
     fit = replace(refiner.fit, screen=max(round(pixel_width(1) / screen), edge))
     field = cast("Field", part)  # only its pictures are drawn
     run = Run(Console(quiet=True), ConversionReport("convert"))
@@ -259,7 +259,7 @@ def refine_part(part: VolumePart, gaussians: Gaussians, refiner: Refiner, distan
     return as_stored(part.moved_out(work.current())) if better else gaussians
 
 
-def view_edge(width: float, screen: float) -> int:
+def _edge_of_views(width: float, screen: float) -> int:
     """Return the pixels along the edge of views of Gaussians, whose pixels are as wide as neighbours are apart.
 
     Args:

@@ -18,7 +18,7 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats import SUFFIXES, encoded, format_of
 from vvgt_cli.gaussians.formats.page_file import iframe
-from vvgt_cli.gaussians.formats.page_values import Layer, Values
+from vvgt_cli.gaussians.formats.page_values import PageLayer, Values
 from vvgt_cli.gaussians.formats.streamed import is_streamed
 from vvgt_cli.gaussians.outputs import Output, check_outputs
 from vvgt_cli.gaussians.rules import INRIA, rule_of
@@ -175,7 +175,7 @@ class Result:
         """Return the values of the volume for a page of at most ``limit`` bytes; None where there are none."""
         return None
 
-    def page_layers(self) -> Sequence[Layer | None]:
+    def page_layers(self) -> Sequence[PageLayer | None]:
         """Return the layers whose values a page holds."""
         return ()
 
@@ -251,7 +251,7 @@ class Conversion(Result):
                 stage.note = str(found or f"none: {why}")
         return self._values[limit]
 
-    def page_layers(self) -> Sequence[Layer | None]:
+    def page_layers(self) -> Sequence[PageLayer | None]:
         """Implement `Result.page_layers`."""
         return self.field.source.page_layers
 

@@ -23,8 +23,7 @@ from vvgt_cli.volume import ReadOptions, Statistics, Volume
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
     from vvgt_cli.dvr.scene import PreparedVolume
-    from vvgt_cli.gaussians.formats.page_values import Layer as PageLayer
-    from vvgt_cli.gaussians.formats.page_values import Values
+    from vvgt_cli.gaussians.formats.page_values import PageLayer, Values
 
 OPTICS = 12  # hexadecimal digits of `StyledVolume.optics`
 KEYS = {"tf": str, "labels": str, "distance": str, "array": str, "component": str, "channel": str, "time": int}
@@ -200,11 +199,11 @@ class StyledVolume:
     @property
     def page_layers(self) -> list[PageLayer | None]:
         """Layers for a page; None: one with colours."""
-        from vvgt_cli.gaussians.formats.page_values import Layer
+        from vvgt_cli.gaussians.formats.page_values import PageLayer
 
         known = self.overall if len(self.layers) == 1 else None
         return [
-            None if layer.colors else Layer(layer.volume, layer.tf, layer.unit_distance, known, self.lighting)
+            None if layer.colors else PageLayer(layer.volume, layer.tf, layer.unit_distance, known, self.lighting)
             for layer in self.layers
         ]
 

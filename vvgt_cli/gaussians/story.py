@@ -19,7 +19,7 @@ from vvgt_cli.look.readers.names import names
 from vvgt_cli.volume.components import listed
 
 if TYPE_CHECKING:
-    from vvgt_cli.gaussians.formats.page_values import Layer
+    from vvgt_cli.gaussians.formats.page_values import PageLayer
 
 MOST, LONG = 100, 2000  # steps; letters of a text, as in page/story.mjs
 SIDES = ("front", "back", "left", "right", "top", "bottom", "fit", "reset")
@@ -46,7 +46,7 @@ class Story:
         """Bytes on a page."""
         return len(json.dumps(self.steps))
 
-    def checked(self, layers: Sequence[Layer | None], frames: int | None = 1) -> Story:
+    def checked(self, layers: Sequence[PageLayer | None], frames: int | None = 1) -> Story:
         """Return the story for a page, with labels by number.
 
         Args:
@@ -239,7 +239,7 @@ CHECKS: dict[str, Check] = {
 }  # fmt: skip
 
 
-def _resolved(step: dict[str, Any], layers: Sequence[Layer], where: str) -> dict[str, Any]:
+def _resolved(step: dict[str, Any], layers: Sequence[PageLayer], where: str) -> dict[str, Any]:
     """Return a step with labels by number; raise DataError for what the layers do not have."""
     number = step.get("layer", 0)
     if number >= len(layers):

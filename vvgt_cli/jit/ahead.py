@@ -12,7 +12,7 @@ VOXEL_MOMENTS = "vvgt_cli.closed_form.voxelwise:voxel_moments"  # of cells wider
 MORTON, MIX = "vvgt_cli.closed_form.cell_kernels:morton_codes", "vvgt_cli.closed_form.sharpen:mix_neighbours"
 AXES_STEPS = "vvgt_cli.refine.steps:own_axes"
 REGRESS = tuple(f"vvgt_cli.refine.steps:{name}" for name in ("adam_sizes", "adam_directions", "regress"))
-PAIR_SUMS, EXACT_AXES = "vvgt_cli.splat.backward:moments", "vvgt_cli.splat.backward:exact_axes"
+PAIR_SUMS, EXACT_AXES = "vvgt_cli.splat.backward:pair_sums", "vvgt_cli.splat.backward:exact_axes"
 VIEW_SLOPES, VIEW_COLORS = "vvgt_cli.splat.harmonics:view_slopes", "vvgt_cli.splat.harmonics:view_colors"
 FIELD_STEPS = "vvgt_cli.refine.steps:adam"  # harmonics take them even where all else steps along own axes
 

@@ -228,7 +228,7 @@ def slope_rows(gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarr
     - log of the scene's RMS error; log of a pixel's width at the origin, less that of a standard deviation.
     """
     from vvgt_cli.splat import gather, project, render
-    from vvgt_cli.splat.render import moments, step_slopes
+    from vvgt_cli.splat.render import pair_sums, step_slopes
 
     g, count = gaussians, len(gaussians)
     total, squares = np.zeros((count, STEP), np.float32), np.zeros((count, STEP), np.float32)
@@ -239,7 +239,7 @@ def slope_rows(gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarr
         projection = project(g, camera, rule)
         image = render(g, camera, projection=projection)
         rest = image - view
-        pairs = moments(projection, g.colors, image, 2 * rest)
+        pairs = pair_sums(projection, g.colors, image, 2 * rest)
         own = step_slopes(g, camera, projection, pairs, g.colors).astype(np.float32)
         total += own
         squares += own * own

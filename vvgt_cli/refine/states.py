@@ -28,8 +28,8 @@ from vvgt_cli.refine.steps import EPSILON
 from vvgt_cli.splat import Projection, blend, project
 from vvgt_cli.splat.render import (
     fields_backward,
-    moments,
     own_axes_backward,
+    pair_sums,
     project_factors,
     screen_slopes,
     seen_colors,
@@ -210,7 +210,7 @@ class OwnAxes(OnHost):
         """Take one step, with harmonics where there are any."""
         means, factors, logits, colors = self.arrays[:4]
         harmonics, seen = self.harmonics, self.colors_from(camera)
-        pairs = moments(projection, seen, image, grad)
+        pairs = pair_sums(projection, seen, image, grad)
         rows, by_harmonics = own_axes_backward(means, factors, seen, camera, projection, pairs, harmonics)
         rates, pace = self.rates(share, speed)
         steps.own_axes(
@@ -302,12 +302,12 @@ class Fields(OnHost):
     ) -> None:
         """Take one step; error and schedule do not matter: 3DGS' rates are constant over so few steps."""
         seen = self.colors_from(camera)
-        self.update(camera, projection, moments(projection, seen, image, grad), seen, self.RATES)
+        self.update(camera, projection, pair_sums(projection, seen, image, grad), seen, self.RATES)
 
     def update(
         self, camera: Camera, projection: Projection, pairs: np.ndarray, seen: np.ndarray, rates: Sequence[float]
     ) -> None:
-        """Apply Adam with ``rates`` to the fields, from the `moments` of a picture with the colours ``seen`` (K, 3)."""
+        """Apply Adam with ``rates`` to the fields, from `pair_sums` of a picture with the colours ``seen`` (K, 3)."""
         gaussians = self.gaussians()
         slopes = fields_backward(gaussians, camera, projection, pairs, seen)
         self.taken += 1
@@ -357,7 +357,7 @@ class Densified(Fields):
     ) -> None:
         """Take one step, with density control where it is due."""
         seen = self.colors_from(camera)
-        pairs = moments(projection, seen, image, grad)
+        pairs = pair_sums(projection, seen, image, grad)
         size = 3 * camera.width * camera.height  # their loss is a mean, ours a sum
         self.slopes += screen_slopes(projection, pairs) * (0.5 * max(camera.width, camera.height) / size)
         self.seen += projection.extent[:, 2] > projection.extent[:, 0]

@@ -154,7 +154,7 @@ def _moments_tile(
 
 
 @parallel_kernel("i8:1 i8:1 i4:1 i8:1 i4:2 f4:2 f4:2 i8 f4:1 f4:3 f4:3 f4:2", fastmath=True, error_model="numpy")
-def moments(
+def pair_sums(
     thread: ThreadSlice,
     tiles: np.ndarray, start: np.ndarray, members: np.ndarray, slots: np.ndarray, extent: np.ndarray, flat: np.ndarray,
     colors: np.ndarray, tiles_x: int, rule: np.ndarray, image: np.ndarray, grad: np.ndarray, pairs: np.ndarray,

@@ -243,8 +243,8 @@ def sum_columns(terms, slopes, n, lane, u, v, parts):  # type: ignore[no-untyped
 
 
 @gpu_kernel("i8:1 u8:1 i8:1 i4:2 f4:2 f4:2 i8 f4:1 f4:3 f4:3 f4:2", fastmath=True)
-def moments(start, keys, first, extent, flat, colors, tiles_x, rule, image, grad, pairs):  # type: ignore[no-untyped-def]
-    """Write each pair's nine `SUMS`, as `backward.moments` does, a block a tile, a thread a pixel.
+def pair_sums(start, keys, first, extent, flat, colors, tiles_x, rule, image, grad, pairs):  # type: ignore[no-untyped-def]
+    """Write each pair's nine `SUMS`, as `backward.pair_sums` does, a block a tile, a thread a pixel.
 
     For `GROUP` Gaussians at a time, threads write their pixels' terms side by side; then they add these up, each a part
     of a column.
@@ -323,7 +323,7 @@ def own_axes(first, pairs, extent, flat, means, factors, colors, view, rule, sta
                 rows[10 + f, k] = sums[6] if f == 0 else sums[7] if f == 1 else sums[8]
 
 
-KERNELS = project, add_up, file_pairs, sort_tiles, blend, moments, own_axes
+KERNELS = project, add_up, file_pairs, sort_tiles, blend, pair_sums, own_axes
 
 
 def view_numbers(camera: Camera) -> np.ndarray:
@@ -388,7 +388,7 @@ class Splatter:
 
     def slopes(self, means: Any, factors: Any, colors: Any, view: Any, grad: Any, rows: Any) -> None:
         """Write gradients along the axes into ``rows`` (13, K), from those by the picture, ``grad`` as ``image``."""
-        moments[self.tiles, AREA, self.stream](
+        pair_sums[self.tiles, AREA, self.stream](
             self.start, self.keys, self.first, self.extent, self.flat, colors, self.across, self.blending, self.image,
             grad, self.pairs,
         )  # fmt: skip

@@ -189,7 +189,7 @@ def render_backward(
     """
     g = gaussians
     seen = seen_colors(g.means, g.colors, g.harmonics, camera.position)
-    return fields_backward(gaussians, camera, projection, moments(projection, seen, image, grad), seen)
+    return fields_backward(gaussians, camera, projection, pair_sums(projection, seen, image, grad), seen)
 
 
 def step_slopes(
@@ -216,7 +216,7 @@ def step_slopes(
 def fields_backward(
     gaussians: Gaussians, camera: Camera, projection: Projection, pairs: np.ndarray, seen: np.ndarray
 ) -> Gradients:
-    """Return `render_backward` from ``pairs``, its `moments`, and the `seen_colors` (K, 3) behind them."""
+    """Return `render_backward` from ``pairs``, its `pair_sums`, and the `seen_colors` (K, 3) behind them."""
     g, slopes = gaussians, step_slopes(gaussians, camera, projection, pairs, seen)
     means = np.einsum("kij,kj->ki", rotations(g.quaternions), slopes[:, :3] / _scales(g))
     (w, x, y, z), (a, b, c) = g.quaternions.T.astype(np.float64), slopes[:, 6:9].T
@@ -237,7 +237,7 @@ def _scales(gaussians: Gaussians) -> np.ndarray:
 
 
 def screen_slopes(projection: Projection, pairs: np.ndarray) -> np.ndarray:
-    """Return the length (K,) float64 of the gradient by the projected centre in pixels, from `moments`."""
+    """Return the length (K,) float64 of the gradient by the projected centre in pixels, from `pair_sums`."""
     from vvgt_cli.splat import tiles
 
     p, sums = projection, np.zeros((len(projection.flat), 5))
@@ -247,14 +247,14 @@ def screen_slopes(projection: Projection, pairs: np.ndarray) -> np.ndarray:
     return lengths
 
 
-def moments(projection: Projection, colors: np.ndarray, image: np.ndarray, grad: np.ndarray) -> np.ndarray:
-    """Return (pairs, 9) float32: what the gradient needs of each (tile, Gaussian) pair, see `backward.moments`."""
+def pair_sums(projection: Projection, colors: np.ndarray, image: np.ndarray, grad: np.ndarray) -> np.ndarray:
+    """Return (pairs, 9) float32: what the gradient needs of each (tile, Gaussian) pair, see `backward.pair_sums`."""
     from vvgt_cli.splat import backward
 
     p = projection
     pairs = np.empty((len(p.members), backward.SUMS), np.float32)
     grad = np.ascontiguousarray(grad, np.float32)
-    backward.moments(
+    backward.pair_sums(
         p.tiles, p.start, p.members, p.slots, p.extent, p.flat, colors, p.tiles_x, p.rule.blending(), image, grad, pairs
     )
     return pairs
@@ -272,7 +272,7 @@ def own_axes_backward(
         colors: (K, 3) float32, those of `seen_colors` where there are harmonics.
         camera: of the picture.
         projection: of `project_factors`.
-        pairs: of `moments` with ``colors``.
+        pairs: of `pair_sums` with ``colors``.
         harmonics: (K, M, 3) float32; None: none.
 
     Returns:

@@ -38,7 +38,7 @@ OF_LABELS = Statistics(0, 0, 0, 0, np.zeros(BINS, np.int64), edges_of(0, 0))
 EXACT = 1e-6  # steps by which rounding may move a mean of equal values
 
 
-class Layer(NamedTuple):
+class PageLayer(NamedTuple):
     """A layer of a volume without colours of its own.
 
     Attributes:
@@ -101,7 +101,7 @@ class Values(NamedTuple):
         )
 
 
-def values_of(layers: Sequence[Layer | None], room: float | None = None, share: int = 1) -> Values | None:
+def values_of(layers: Sequence[PageLayer | None], room: float | None = None, share: int = 1) -> Values | None:
     """Return the grids of layers, read part by part.
 
     Args:
@@ -123,7 +123,7 @@ def values_of(layers: Sequence[Layer | None], room: float | None = None, share: 
     return grids
 
 
-def _grids(layers: Sequence[Layer | None], most: int, limited: bool = False) -> Values | None:
+def _grids(layers: Sequence[PageLayer | None], most: int, limited: bool = False) -> Values | None:
     """Return the grids of layers, of at most so many cells together, as `values_of` does."""
     shown = [(number, layer) for number, layer in enumerate(layers) if layer is not None]
     facts, contents, looks, offered = [], [], [], []
