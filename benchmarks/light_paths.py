@@ -4,6 +4,8 @@
 
 `grid_db`: dB over RGB of the ray-cast view (test view 3, 3 x 3 rays a pixel) against the picture of paths; `noise_db`:
 of the latter, from its halves; `light_seconds`: processor time of the grid. Repeat `--paths` for a curve.
+With `--gaussians K`, `ply_db` of a conversion for a screen of this size, and `ply_grid_db` beside the view, too; all are
+then without the noise of the paths: the mean of the product of the differences from the two halves.
 With `--pictures DIR` no rows, but a JPEG a scene: unlit, under a headlight, and under the first sky.
 """
 
@@ -19,19 +21,35 @@ import numpy as np
 from dvr_scenes import commit, read_scenes, write_rows
 from floors import machine
 
+import vvgt_cli as vvgt
 from tests.paths_twin import path_view
-from vvgt_cli.cameras import default_views
+from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.dvr import RenderSettings, Scene, render_view
 from vvgt_cli.dvr.sky import sky_of
+from vvgt_cli.field.source import StyledVolume
+from vvgt_cli.library.inputs import Look
 from vvgt_cli.look.lighting import SKIES, LightOptions
+from vvgt_cli.splat.render import render
 
 
-def decibels(error: np.ndarray) -> float:
-    return float(-10 * np.log10(np.mean(error[..., :3].astype(float) ** 2)))
+def decibels(error: np.ndarray, other: np.ndarray | None = None) -> float:
+    """PSNR of an error, or of what two have in common."""
+    other = error if other is None else other
+    return float(-10 * np.log10(np.mean(error[..., :3].astype(float) * other[..., :3])))
 
 
-def measure(scene: Scene, name: str, size: int, counts: tuple[int, ...]) -> Iterator[dict[str, Any]]:
+def converted(source: StyledVolume, light: str, size: int, gaussians: int, camera: Camera) -> np.ndarray:
+    """A conversion's picture; its seconds are those of the whole, with scores."""
+    look = Look(source.tf, opacity_unit_distance=source.unit_distance, light=light)
+    result = vvgt.convert(source.volume, look, max_gaussians=gaussians, screen=size, progress=True)
+    return render(result.gaussians, camera)
+
+
+def measure(
+    source: StyledVolume, name: str, size: int, counts: tuple[int, ...], gaussians: int | None
+) -> Iterator[dict[str, Any]]:
     """A row for each number of paths a pixel."""
+    scene = source.scene()
     lighting = LightOptions((name,)).lighting(None, scene.volume.space)
     assert lighting is not None
     began = time.process_time()
@@ -39,11 +57,20 @@ def measure(scene: Scene, name: str, size: int, counts: tuple[int, ...]) -> Iter
     spent, camera = time.process_time() - began, default_views("test", size=size)[3]
     image = render_view(lit, camera, RenderSettings(samples=3))
     sky = sky_of(name, np.array(lighting.directions[0]), scene.volume.axes)
+    shown = {"grid_db": image}
+    if gaussians:
+        shown["ply_db"] = converted(source, name, size, gaussians, camera)
     for paths in counts:
         halves = [path_view(scene.scattering(), sky, scene.half, camera, paths // 2, seed) for seed in (1, 1 << 20)]
         traced = (halves[0] + halves[1]) / 2
         noise = decibels((halves[0] - halves[1]) / 2)
-        yield {"paths": paths, "grid_db": decibels(image - traced), "noise_db": noise, "light_seconds": spent}
+        row: dict[str, Any] = {"paths": paths}
+        for key, one in shown.items():
+            first, second = (one - half for half in halves) if gaussians else (one - traced,) * 2
+            row[key] = decibels(first, second)
+        if gaussians:
+            row["ply_grid_db"] = decibels(shown["ply_db"] - image)
+        yield row | {"noise_db": noise, "light_seconds": spent}
 
 
 def picture(scene: Scene, sky: str, size: int, target: Path) -> None:
@@ -66,11 +93,12 @@ def picture(scene: Scene, sky: str, size: int, target: Path) -> None:
 @click.option("--size", type=int, default=64)
 @click.option("--sky", "skies", multiple=True, default=SKIES)
 @click.option("--paths", type=int, multiple=True, default=(512,))
+@click.option("--gaussians", type=int)
 @click.option("-o", "--output", type=click.Path())
 @click.option("--pictures", type=click.Path(file_okay=False))
 def main(
     places: tuple[str, str, str], scenes: tuple[str, ...], size: int, skies: tuple[str, ...], paths: tuple[int, ...],
-    output: str | None, pictures: str | None,
+    gaussians: int | None, output: str | None, pictures: str | None,
 ) -> None:  # fmt: skip
     rows: list[dict[str, Any]] = []
     for name, source in read_scenes(*places, scenes or None):
@@ -78,7 +106,7 @@ def main(
             picture(source.scene(), skies[0], size, Path(pictures) / f"{name}-{skies[0]}.jpg")
             continue
         for sky in skies:
-            for row in measure(source.scene(), sky, size, paths):
+            for row in measure(source, sky, size, paths, gaussians):
                 rows.append({"scene": name, "sky": sky, **row, "size": size, "commit": commit()})
                 rows[-1]["machine"] = machine().split(", load")[0]
                 print(rows[-1], flush=True)
