@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import vvgt_cli
+from tests.processes import replaced
 from tests.test_formats_server import ask
 from tests.test_scale import bodies
 from vvgt_cli.commands.server import Site, served
@@ -207,10 +208,11 @@ def test_what_has_no_levels_is_refused_in_a_line(vvgt, volume: Path, tmp_path: P
 
 def test_levels_have_a_certificate_of_what_viewers_show(vvgt, volume: Path, tmp_path: Path) -> None:
     out, picture = tmp_path / "out", tmp_path / "p.png"
-    line = ("convert", volume, *FIT, "--steps", "4", "--preview", picture, "--checkpoint", tmp_path / "c")
+    small = replaced(FIT, "--max-gaussians", "2000", "--screen", "100")
+    line = ("convert", volume, *small, "--steps", "4", "--preview", picture, "--checkpoint", tmp_path / "c")
     vvgt.ok(*line, "--device", "cpu", "-o", out / "lod-meta.json")
     assert {path.name for path in tmp_path.iterdir()} == {"out", "p.png"}
-    assert read_png(picture).shape[:2] == (3 * (18 + 150), 450)
+    assert read_png(picture).shape[:2] == (3 * (18 + 100), 300)
     made = json.loads(vvgt.ok("info", out, "--json").out)["certificate"]
     assert {"from 6", "from 1.2", "from 0.6"} < set(made["conditions"])
     shown = json.loads(vvgt.ok("evaluate", out, "--volume", volume, "-q", "--json").out)
