@@ -163,15 +163,3 @@ def test_the_frame_of_a_file_is_kept_where_it_was_made_elsewhere(folder, call, t
     named = ("frame", "up", "scale", "centre", "unit_distance", "sh_degree", "count")
     assert [getattr(far[1], name) for name in named] == [getattr(same[1], name) for name in named]
     np.testing.assert_allclose(same[0].means, far[0].means, rtol=1e-5)
-
-
-def test_convert_refines_after_the_closed_form(tmp_path, vvgt):
-    small = ("--screen", 32, "--max-gaussians", 100, "--report", tmp_path / "r.json")
-    vvgt.ok("convert", *SCENE, *small, "--steps", 30, "-o", tmp_path / "a.ply")
-    report = json.loads((tmp_path / "r.json").read_text())
-    stages = {stage["name"]: stage for stage in report["stages"]}
-    assert "back-projection" not in stages
-    assert stages["refinement"]["psnr"] > stages["refinement"]["psnr_before"] + 1
-    assert report["scores"]["psnr"] > stages["refinement"]["psnr_before"]
-    assert report["options"]["steps"] == report["refinement"]["steps"] == 30
-    assert "24 of 32 px to fit to" in stages["views"]["note"]

@@ -247,15 +247,6 @@ def test_what_blocks_cannot_do_is_a_line(vvgt, raw, tmp_path):
     assert vvgt("merge", tmp_path, "-o", tmp_path / "d.ply").code == 2
 
 
-def test_a_label_map_by_name_is_not_taken_for_scalars_in_blocks(vvgt, raw, tmp_path):
-    named = tmp_path / f"head_labels_{raw.name.split('_', 1)[1]}"
-    named.write_bytes(raw.read_bytes())
-    assert "distinct colours" in vvgt.ok("init", named, "-o", tmp_path / "a.ply", *FIT[:-1], "--blocks", "32").err
-    vvgt.ok("init", named, "-o", tmp_path / "b.ply", *FIT, "--blocks", "32", "--labels", "none")
-    assert (tmp_path / "a.ply").read_bytes() != (tmp_path / "b.ply").read_bytes()
-    assert not list(tmp_path.glob(".*blocks"))
-
-
 def test_a_box_that_is_counted_slice_by_slice_has_the_counts_and_samples_of_the_whole(raw, tmp_path):
     from vvgt_cli.field.block_store import COUNTS, BlockStore
     from vvgt_cli.field.counting import CountBlocks
