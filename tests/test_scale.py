@@ -223,11 +223,12 @@ def test_memory_decides_by_itself(vvgt, tmp_path, monkeypatch):
     assert same_gaussians(tmp_path / "a.ply", tmp_path / "b.ply")
     monkeypatch.setattr("vvgt_cli.volume.blocks.free_memory", lambda: 1 << 20)
     vvgt.ok("render-views", source, "-o", tmp_path / "views", "--size", "40", "--views", "2")
+    few = ("--max-gaussians", "300", "--screen", "48", "--steps", "2")
     assert (
         "processed in blocks"
         in vvgt.ok("evaluate", tmp_path / "b.ply", "--volume", source, "--step 2 --screen 48 --no-conditions").err
     )
-    assert "processed in blocks" in vvgt.ok("convert", source, "-o", tmp_path / "d.ply", *FIT[:-1], "--steps", "8").err
+    assert "processed in blocks" in vvgt.ok("convert", source, "-o", tmp_path / "d.ply", *few).err
     monkeypatch.setattr("vvgt_cli.field.settings.free_memory", lambda: 200 << 20)
     assert "MiB more" in vvgt.fails(2, "init", source, "-o", tmp_path / "c.ply", *FIT[:-1])
 

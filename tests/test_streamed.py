@@ -372,7 +372,7 @@ def test_manifests_that_cannot_be_are_one_line(folder, tmp_path, change, text) -
 def test_a_level_is_one_cloud_for_every_command(vvgt, volume: Path, folder: Path, tmp_path: Path) -> None:
     found = []
     for name in (f"{folder}#0", f"{folder / 'lod-meta.json'}#1", f"{folder}"):
-        line = ("evaluate", name, "--volume", volume, "--no-conditions", "--step", 1, "--json")
+        line = ("evaluate", name, "--volume", volume, "--no-conditions", "--step", 2, "--json")
         found.append(json.loads(vvgt(*line).out))
     counts = json.loads((folder / "lod-meta.json").read_text())["counts"]
     assert [scores["gaussians"] for scores in found] == [*counts[:2], counts[0]]
@@ -437,7 +437,7 @@ def test_unreadable_levels_are_reported_in_a_line(vvgt, folder: Path, tmp_path: 
 
 
 def test_finished_gaussians_are_not_saved_as_levels(tmp_path: Path) -> None:
-    result = vvgt_cli.convert(np.arange(512, dtype=np.float32).reshape(8, 8, 8), max_gaussians=20, steps=0)
+    result = vvgt_cli.convert(np.arange(512, dtype=np.float32).reshape(8, 8, 8), max_gaussians=20, screen=32, steps=0)
     with pytest.raises(UsageError, match="streamed levels need the volume"):
         result.save(tmp_path / "lod-meta.json")
     assert not list(tmp_path.iterdir())
