@@ -106,7 +106,7 @@ def small_conversions() -> None:
 
 @pytest.fixture
 def small_screen(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Convert for 64 px where no screen is stated, in this process and in those that it starts."""
+    """Convert for 64 px, with few Gaussians, where nothing is stated, in this process and in those that it starts."""
     from vvgt_cli.conversion.request import FitOptions
 
     monkeypatch.setenv(SCREEN, "64")

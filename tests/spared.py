@@ -5,6 +5,7 @@ import sys
 from importlib import import_module
 
 SCREEN = "VVGT_TEST_SCREEN"  # the default of ``--screen``, for commands that do not take it: `vvgt view`
+BUDGET = 1000  # of Gaussians, beside it
 
 
 def spare() -> None:
@@ -18,9 +19,9 @@ def spare() -> None:
 
 
 def defaults(screen: int) -> tuple[object, ...]:
-    """Return the defaults of a fit, in the order of its options, with another screen."""
+    """Return the defaults of a fit, in the order of its options, with another screen and `BUDGET`."""
     usual = import_module("vvgt_cli.conversion.request").FitOptions.__init__.__defaults__
-    return (usual[0], screen, *usual[2:])
+    return (BUDGET, screen, *usual[2:])
 
 
 if __name__ == "__main__":

@@ -21,8 +21,7 @@ CALLS = {
 }
 
 
-@pytest.mark.parametrize("blocks", [None, 16], ids=["memory", "blocks"])
-@pytest.mark.parametrize("kind", CALLS)
+@pytest.mark.parametrize(("kind", "blocks"), [*((kind, None) for kind in CALLS), ("labels", 16)])
 def test_files_and_index_are_those_of_the_command(vvgt_run, at, kind, blocks):  # noqa: F811
     volume, look, how = CALLS[kind]
     result = vvgt.convert(volume, look, **GOAL, blocks=blocks, **how)

@@ -33,7 +33,6 @@ def saved(result: vvgt.Result, path: Path) -> bytes:
 
 
 LOOKS = {
-    "function": vvgt.Look(TF),
     "no function": vvgt.Look(),
     "lit": vvgt.Look(TF, light="headlight"),
     "labels": vvgt.Look(labels="auto"),

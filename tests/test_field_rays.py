@@ -209,7 +209,6 @@ def test_what_blocks_cannot_do_is_a_line(vvgt, tmp_path):
     path = tmp_path / "v_100x90x80_uint8.raw"
     path.write_bytes(bytes(720000))
     for command, options, word in (
-        ("init", ("--init", "wavelet", "-o", tmp_path / "a" / "lod-meta.json"), "cuts of moments"),
         ("init", ("--shard", "1/2", "--init", "wavelet", "-o", tmp_path / "a"), "folder of blocks"),
         ("render-views", ("--blocks", "32", "--renderer", "vtk", "-o", tmp_path / "v"), "needs the whole volume"),
     ):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests import anatomy
-from tests.random_clouds import turns
+from tests.random_clouds import random_cloud, turns
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.boxed import to_box_frame
 from vvgt_cli.cameras.files import read_cameras, transforms_json
@@ -296,11 +296,7 @@ def test_preview_is_the_right_way_round_and_up(vvgt) -> None:
 
 @pytest.mark.parametrize("matrix", [anatomy.OBLIQUE, anatomy.OBLIQUE * (1, -1, 1), -np.eye(3)])
 def test_a_turned_scene_is_seen_by_a_turned_camera(matrix: np.ndarray) -> None:
-    rng = np.random.default_rng(3)
-    cloud = Gaussians(
-        rng.uniform(-0.6, 0.6, (60, 3)), rng.uniform(-4, -2, (60, 3)), rng.normal(size=(60, 4)),
-        rng.uniform(-1, 3, 60), rng.uniform(0, 1, (60, 3)),
-    )  # fmt: skip
+    cloud = random_cloud(60, 3, 0.05, 0.6, (1, 1.2))
     camera: Camera = replace(default_views("train", size=64)[5], cx=30.0, cy=35.0)
     expected = render(transform(cloud, matrix), camera)
     inside, mirrored = to_box_frame(camera, matrix)

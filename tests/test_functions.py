@@ -22,13 +22,16 @@ def functions(tmp_path):
 def test_each_function_gets_the_file_that_it_gets_alone(vvgt, tmp_path, functions):
     bone, skin = functions
     out = str(tmp_path / "blob_{}.ply")
-    done = vvgt.ok("convert", "example:blob:16", "--tf", bone, "--tf", skin, "-o", out, *HOW)
+    beside = ("--report", tmp_path / "{}.report.json", "--preview", tmp_path / "{}.png")
+    done = vvgt.ok("convert", "example:blob:16", "--tf", bone, "--tf", skin, "-o", out, *HOW, *beside)
     assert done.err.count("volume ") == 1
     assert "function 2 of 2" in done.err
     for name, tf in (("bone", bone), ("skin", skin)):
         alone = tmp_path / f"alone-{name}.ply"
         vvgt.ok("convert", "example:blob:16", "--tf", tf, "-o", str(alone), *HOW)
         assert uncertified(tmp_path / f"blob_{name}.ply") == uncertified(alone)
+        assert json.loads((tmp_path / f"{name}.report.json").read_text())["transfer_function"]["name"]
+        assert (tmp_path / f"{name}.png").stat().st_size > 0
     assert "blob_bone.ply" in vvgt.fails(2, "convert", "example:blob:16", "--tf", bone, "--tf", skin, "-o", out, *HOW)
 
 
@@ -47,15 +50,6 @@ def test_each_function_gets_the_levels_that_it_gets_alone(vvgt, tmp_path, functi
     assert [row["file"] for row in rows] == ["bone/lod-meta.json", "skin/lod-meta.json"]
     assert contents(tmp_path / "heads" / "skin") != contents(tmp_path / "alone")
     assert "bone/lod-meta.json exists" in vvgt.fails(2, *line, "--tf", skin, *out)
-
-
-def test_reports_and_previews_have_the_name_too(vvgt, tmp_path, functions):
-    names = [str(tmp_path / name) for name in ("{}.ply", "{}.report.json", "{}.png")]
-    line = ("convert", "example:blob:16", "--tf", functions[0], "--tf", functions[1], *HOW)
-    vvgt.ok(*line, "-o", names[0], "--report", names[1], "--preview", names[2])
-    for name in ("bone", "skin"):
-        assert json.loads((tmp_path / f"{name}.report.json").read_text())["transfer_function"]["name"]
-        assert (tmp_path / f"{name}.png").stat().st_size > 0
 
 
 @pytest.mark.parametrize(

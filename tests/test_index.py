@@ -53,8 +53,7 @@ FACTS = {
 }
 
 
-@pytest.mark.parametrize("blocks", [(), ("--blocks", "16")], ids=["memory", "blocks"])
-@pytest.mark.parametrize("kind", LINES)
+@pytest.mark.parametrize(("kind", "blocks"), [*((kind, ()) for kind in LINES), ("functions", ("--blocks", "16"))])
 def test_what_an_index_says(vvgt, at, kind, blocks):
     out = ("-o", "x_{}.ply", *HOW, *blocks)
     vvgt.ok("convert", *LINES[kind], *out)

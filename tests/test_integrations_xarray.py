@@ -30,24 +30,6 @@ def test_it_converts_as_the_library_does() -> None:
     assert array().vvgt.session(time=0).volume.dims == (8, 10, 12)
 
 
-def test_arrays_of_dask_are_never_read_as_a_whole() -> None:
-    dask = pytest.importorskip("dask")
-    from dask.core import flatten
-
-    whole = xarray.DataArray(np.indices((40, 40, 40)).sum(axis=0).astype(np.float32), dims=("z", "y", "x"))
-    lazy = whole.chunk({"z": 20, "y": 20, "x": 20})
-    asked = []
-
-    def get(graph, keys, **more):
-        asked.append(len(list(flatten(keys))))
-        return dask.get(graph, keys, **more)
-
-    with dask.config.set(scheduler=get):
-        assert len(lazy.vvgt.convert("viridis", **GOAL, blocks=16).gaussians) > 50
-    assert len(asked) >= 8
-    assert max(asked) < 8  # chunks at once, of eight
-
-
 def test_the_library_alone_registers_nothing() -> None:
     code = "import numpy, xarray, vvgt_cli; vvgt_cli.convert; print(hasattr(xarray.DataArray(numpy.zeros(3)), 'vvgt'))"
     assert python("-c", code)[0].strip() == "False"

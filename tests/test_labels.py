@@ -171,11 +171,12 @@ def test_of_several_layers_one_may_be_hidden(vvgt, tmp_path: Path, seg: Path) ->
         assert "none of its labels is visible" in vvgt.fails(1, "convert", seg, "--labels", none, *SMALL, *more)
 
 
-def test_a_recognised_label_map_is_reported_and_none_reads_scalars(vvgt, tmp_path: Path, seg: Path) -> None:
+@pytest.mark.parametrize("blocks", [(), ("--blocks", 16)], ids=["memory", "blocks"])
+def test_a_recognised_label_map_is_reported_and_none_reads_scalars(vvgt, tmp_path: Path, seg: Path, blocks) -> None:
     with pytest.warns(UserWarning, match="balls_seg: read as a label map by its name"):
-        done = vvgt("init", seg, *SMALL[:4], "-o", tmp_path / "a.ply")
+        done = vvgt.ok("init", seg, *SMALL[:4], *blocks, "-o", tmp_path / "a.ply")
     assert "distinct colours" in done.err
-    plain = vvgt("init", seg, "--labels", "none", *SMALL[:4], "-o", tmp_path / "b.ply")
+    plain = vvgt.ok("init", seg, "--labels", "none", *SMALL[:4], *blocks, "-o", tmp_path / "b.ply")
     assert "label map" not in plain.err
     assert "automatic" in plain.err
     assert (tmp_path / "a.ply").read_bytes() != (tmp_path / "b.ply").read_bytes()

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from tests.random_clouds import random_cloud
 from vvgt_cli.cameras import default_views
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.refine import OptimizeOptions, optimize
@@ -14,14 +15,7 @@ CAMERAS = default_views("train", 6, size=48)
 
 
 def cloud(count=60, sigma=0.02, seed=0):
-    rng = np.random.default_rng(seed)
-    return Gaussians(
-        rng.uniform(-0.6, 0.6, (count, 3)),
-        np.log(sigma) + rng.normal(0, 0.1, (count, 3)),
-        rng.normal(size=(count, 4)),
-        rng.uniform(-2, 1, count),
-        rng.uniform(0, 1, (count, 3)),
-    )
+    return random_cloud(count, seed, sigma, 0.1, (-0.5, 0.9))
 
 
 def views(g):

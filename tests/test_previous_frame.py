@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from tests.headers import uncertified
+from tests.processes import replaced
 from tests.random_clouds import random_cloud
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.blocks import BLOCK
@@ -303,12 +304,14 @@ def test_a_frame_that_shows_something_else_is_converted_by_itself(vvgt, beat):
 
 @pytest.mark.parametrize(
     "more",
-    [("--shard", "1/1"), ("--light", "sun")],
+    [("--shard", "1/1"), ("--light", "sun", "--steps", "4")],
     ids=lambda more: more[0],
 )
 def test_what_cannot_go_on_is_converted_frame_by_frame(vvgt, beat, more):
     """A part of a series (here all of it) goes on too; the others have each frame by itself."""
     for file in ("v_2.npy", "v_3.npy"):
         (beat / file).unlink()
-    done = vvgt.ok("convert", beat / "v_*.npy", "--tf", beat / "tf.json", *HOW, *more, "-o", beat / "f_{}.ply")
+    done = vvgt.ok(
+        "convert", beat / "v_*.npy", "--tf", beat / "tf.json", *replaced(HOW, *more), "-o", beat / "f_{}.ply"
+    )
     assert ("differences " in done.err) == (more[0] == "--shard")

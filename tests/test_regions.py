@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import vvgt_cli
+from tests.processes import replaced
 from tests.test_scale import bodies
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.commands.main import run
@@ -29,7 +30,7 @@ from vvgt_cli.refine import OptimizeOptions, OptimizeRecord, optimize
 from vvgt_cli.splat import render
 from vvgt_cli.volume import ReadOptions
 
-FIT = ("--max-gaussians", "6000", "--screen", "150", "--up", "z", "-q")
+FIT = ("--max-gaussians", "2400", "--screen", "100", "--up", "z", "-q")
 STEPS = ("--steps", "24")
 SINGLE = RenderSettings(step=1.0, samples=1)
 
@@ -203,7 +204,8 @@ def test_bytes_depend_on_neither_blocks_nor_workers(vvgt, volume, folder, tmp_pa
 
 def test_an_interrupted_refinement_goes_on_where_it_ended(vvgt, volume, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr("vvgt_cli.conversion.cut.ENOUGH", 1)  # the tiles are regions
-    line = ("convert", volume, *FIT, "--steps", "4", "--blocks", "64", "-o", tmp_path / "out" / "lod-meta.json")
+    fit = replaced(FIT, "--max-gaussians", "1000")
+    line = ("convert", volume, *fit, "--steps", "2", "--blocks", "64", "-o", tmp_path / "out" / "lod-meta.json")
     vvgt.ok(*line[:-1], tmp_path / "whole" / "lod-meta.json")
     call, seen = PartTask.__call__, list[int]()
 
@@ -224,10 +226,10 @@ def test_an_interrupted_refinement_goes_on_where_it_ended(vvgt, volume, tmp_path
 
 
 def test_large_clouds_are_refined_by_regions_lit_in_other_formats(vvgt, volume, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("vvgt_cli.conversion.request.MANY", 5000)
+    monkeypatch.setattr("vvgt_cli.conversion.request.MANY", 2000)
     vvgt.ok("init", volume, *FIT, "-o", tmp_path / "closed.ply")
-    for name, options in (("a.ply", STEPS), ("b.spz", ("--steps", "4", "--light", "headlight"))):
-        found = vvgt.ok("convert", volume, *FIT[:-1], "--blocks", "32", *options, "-o", tmp_path / name)
+    for name, options in (("a.ply", STEPS), ("b.spz", ("--steps", "2", "--light", "headlight"))):
+        found = vvgt.ok("convert", volume, *FIT[:-1], "--blocks", "64", *options, "-o", tmp_path / name)
         assert "refined part by part" in found.err
         made, closed = (read_splats(str(tmp_path / file))[0] for file in (name, "closed.ply"))
         assert len(made) == pytest.approx(len(closed), rel=0.03)  # those that no viewer draws are left out
@@ -253,7 +255,7 @@ def test_workers_are_as_many_as_threads_memory_and_work_allow(monkeypatch: pytes
 def test_results_of_another_number_of_steps_are_not_taken(vvgt, volume: Path, folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     shutil.copytree(folder, out)
-    line = ("convert", volume, *FIT, "--steps", "8", "-o", out / "lod-meta.json", "--overwrite")
+    line = ("convert", volume, *FIT, "--steps", "2", "-o", out / "lod-meta.json", "--overwrite")
     vvgt.ok(*line)
     assert files_in(out) != files_in(folder)
 

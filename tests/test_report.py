@@ -1,6 +1,5 @@
 """`vvgt report`: all runs end to end; fronts, tables, charts, the page, comparisons."""
 
-import copy
 import csv
 import io
 import json
@@ -144,17 +143,23 @@ def test_nothing_is_overwritten_unasked(scene_report, vvgt):
     assert "exists; give --overwrite" in vvgt.fails(2, "report", "example:blob:10", *SMALL, "-o", folder)
 
 
-def test_compare_reads_reports_and_conversions(scene_report, vvgt, tmp_path):
-    folder, _ = scene_report
+def test_compare_reads_reports_and_conversions_and_gives_them_different_names(scene_report, vvgt, tmp_path):
+    folder, found = scene_report
     vvgt.ok("convert", "example:blob:10", "--tf", "viridis", "--screen", 24, "--max-gaussians", 60,
-                "-o", tmp_path / "a.ply", "--report", tmp_path / "a.json")  # fmt: skip
-    result = vvgt.ok("report", "--compare", folder / "report.json", tmp_path / "a.json", "-o", tmp_path / "both")
-    assert {p.name for p in (tmp_path / "both").iterdir()} == {"report.csv", "report.html", *FILES}
-    text = (tmp_path / "both" / "report.html").read_text("utf-8")
+                "-o", tmp_path / "c.ply", "--report", tmp_path / "c.json")  # fmt: skip
+    (tmp_path / "a").mkdir()
+    twin = tmp_path / "a" / "report.json"
+    twin.write_text(json.dumps(document()))
+    reports = (twin, folder / "report.json", twin, tmp_path / "c.json")
+    result = vvgt.ok("report", "--compare", *reports, "-o", tmp_path / "all")
+    assert {p.name for p in (tmp_path / "all").iterdir()} == {"report.csv", "report.html", *FILES}
+    text = (tmp_path / "all" / "report.html").read_text("utf-8")
     Reader(text)
-    assert "out: closed form, K = 60" in text
-    assert "a: convert, K 60" in text
-    assert "a: 1 runs" in result.err
+    for name in ("a (1): 25 steps: ", "out: closed form, K = 60", "a (3): 25 steps: ", "c: convert, K 60"):
+        assert name in text
+    assert "c: 1 runs" in result.err
+    rows = list(csv.DictReader(io.StringIO((tmp_path / "all" / "report.csv").read_text())))
+    assert len(rows) == 2 * len(runs()) + len(found["runs"]) + 1
 
 
 @pytest.mark.parametrize(
@@ -267,23 +272,6 @@ def test_names_cannot_break_out_of_the_page():
     assert reader.tags.count("img") == 4
     assert reader.tags.count("script") == 2
     assert "u" not in reader.tags
-
-
-def test_several_reports_have_different_names(tmp_path, vvgt):
-    other = copy.deepcopy(document())
-    for one in other["runs"]:
-        one["scores"]["psnr"] -= 1
-    for name, content in (("a", document()), ("b", other)):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "report.json").write_text(json.dumps(content))
-    vvgt.ok("report", "--compare", tmp_path / "a" / "report.json", tmp_path / "b" / "report.json",
-                  tmp_path / "a" / "report.json", "-o", tmp_path / "c")  # fmt: skip
-    text = (tmp_path / "c" / "report.html").read_text("utf-8")
-    Reader(text)
-    for name in ("a (1)", "b", "a (3)"):
-        assert f"{name}: 25 steps: " in text
-    rows = list(csv.DictReader(io.StringIO((tmp_path / "c" / "report.csv").read_text())))
-    assert len(rows) == 3 * len(runs())
 
 
 def test_rungs_follow_the_options_and_random_points_fill_the_box():

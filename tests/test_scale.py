@@ -223,11 +223,12 @@ def test_memory_decides_by_itself(vvgt, tmp_path, monkeypatch):
     assert same_gaussians(tmp_path / "a.ply", tmp_path / "b.ply")
     monkeypatch.setattr("vvgt_cli.volume.blocks.free_memory", lambda: 1 << 20)
     vvgt.ok("render-views", source, "-o", tmp_path / "views", "--size", "40", "--views", "2")
+    few = ("--max-gaussians", "300", "--screen", "48", "--steps", "2")
     assert (
         "processed in blocks"
         in vvgt.ok("evaluate", tmp_path / "b.ply", "--volume", source, "--step 2 --screen 48 --no-conditions").err
     )
-    assert "processed in blocks" in vvgt.ok("convert", source, "-o", tmp_path / "d.ply", *FIT[:-1], "--steps", "8").err
+    assert "processed in blocks" in vvgt.ok("convert", source, "-o", tmp_path / "d.ply", *few).err
     monkeypatch.setattr("vvgt_cli.field.settings.free_memory", lambda: 200 << 20)
     assert "MiB more" in vvgt.fails(2, "init", source, "-o", tmp_path / "c.ply", *FIT[:-1])
 
@@ -245,15 +246,6 @@ def test_what_blocks_cannot_do_is_a_line(vvgt, raw, tmp_path):
     packed.write_bytes(gzip.compress(raw.read_bytes()))
     vvgt.ok("init", packed, "-o", tmp_path / "c.ply", *FIT, "--blocks", "auto")  # small: unpacked
     assert vvgt("merge", tmp_path, "-o", tmp_path / "d.ply").code == 2
-
-
-def test_a_label_map_by_name_is_not_taken_for_scalars_in_blocks(vvgt, raw, tmp_path):
-    named = tmp_path / f"head_labels_{raw.name.split('_', 1)[1]}"
-    named.write_bytes(raw.read_bytes())
-    assert "distinct colours" in vvgt.ok("init", named, "-o", tmp_path / "a.ply", *FIT[:-1], "--blocks", "32").err
-    vvgt.ok("init", named, "-o", tmp_path / "b.ply", *FIT, "--blocks", "32", "--labels", "none")
-    assert (tmp_path / "a.ply").read_bytes() != (tmp_path / "b.ply").read_bytes()
-    assert not list(tmp_path.glob(".*blocks"))
 
 
 def test_a_box_that_is_counted_slice_by_slice_has_the_counts_and_samples_of_the_whole(raw, tmp_path):

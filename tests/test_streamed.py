@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import vvgt_cli
+from tests.processes import replaced
 from tests.test_formats_server import ask
 from tests.test_scale import bodies
 from vvgt_cli.commands.server import Site, served
@@ -207,10 +208,11 @@ def test_what_has_no_levels_is_refused_in_a_line(vvgt, volume: Path, tmp_path: P
 
 def test_levels_have_a_certificate_of_what_viewers_show(vvgt, volume: Path, tmp_path: Path) -> None:
     out, picture = tmp_path / "out", tmp_path / "p.png"
-    line = ("convert", volume, *FIT, "--steps", "4", "--preview", picture, "--checkpoint", tmp_path / "c")
+    small = replaced(FIT, "--max-gaussians", "2000", "--screen", "100")
+    line = ("convert", volume, *small, "--steps", "4", "--preview", picture, "--checkpoint", tmp_path / "c")
     vvgt.ok(*line, "--device", "cpu", "-o", out / "lod-meta.json")
     assert {path.name for path in tmp_path.iterdir()} == {"out", "p.png"}
-    assert read_png(picture).shape[:2] == (3 * (18 + 150), 450)
+    assert read_png(picture).shape[:2] == (3 * (18 + 100), 300)
     made = json.loads(vvgt.ok("info", out, "--json").out)["certificate"]
     assert {"from 6", "from 1.2", "from 0.6"} < set(made["conditions"])
     shown = json.loads(vvgt.ok("evaluate", out, "--volume", volume, "-q", "--json").out)
@@ -370,7 +372,7 @@ def test_manifests_that_cannot_be_are_one_line(folder, tmp_path, change, text) -
 def test_a_level_is_one_cloud_for_every_command(vvgt, volume: Path, folder: Path, tmp_path: Path) -> None:
     found = []
     for name in (f"{folder}#0", f"{folder / 'lod-meta.json'}#1", f"{folder}"):
-        line = ("evaluate", name, "--volume", volume, "--no-conditions", "--step", 1, "--json")
+        line = ("evaluate", name, "--volume", volume, "--no-conditions", "--step", 2, "--json")
         found.append(json.loads(vvgt(*line).out))
     counts = json.loads((folder / "lod-meta.json").read_text())["counts"]
     assert [scores["gaussians"] for scores in found] == [*counts[:2], counts[0]]
@@ -435,7 +437,7 @@ def test_unreadable_levels_are_reported_in_a_line(vvgt, folder: Path, tmp_path: 
 
 
 def test_finished_gaussians_are_not_saved_as_levels(tmp_path: Path) -> None:
-    result = vvgt_cli.convert(np.arange(512, dtype=np.float32).reshape(8, 8, 8), max_gaussians=20, steps=0)
+    result = vvgt_cli.convert(np.arange(512, dtype=np.float32).reshape(8, 8, 8), max_gaussians=20, screen=32, steps=0)
     with pytest.raises(UsageError, match="streamed levels need the volume"):
         result.save(tmp_path / "lod-meta.json")
     assert not list(tmp_path.iterdir())

@@ -3,7 +3,6 @@
 import http.client
 import io
 import json
-import os
 import pickle
 import re
 import signal
@@ -20,6 +19,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
+from tests.test_field_runners import ended
 from tests.test_formats_server import ask, cloud, shown
 from tests.test_live import GRAIN, HI, LO, RAMP, facts
 from tests.test_live import cloud as live_cloud
@@ -176,7 +176,7 @@ def test_what_is_cancelled_stops_and_an_interrupt_leaves_nothing(tmp_path: Path,
         child.send_signal(signal.SIGINT)
         child.send_signal(signal.SIGINT)  # impatiently
         assert child.wait(60) == 0
-        until(lambda: not os.path.exists(f"/proc/{pid}"), AT_ONCE)
+        assert ended(pid)
     assert list(temporary.iterdir()) == []
 
 
@@ -185,7 +185,7 @@ def test_a_conversion_ends_with_a_server_that_is_killed(tmp_path: Path, temporar
         until(lambda: bool(workers(child.pid)))
         (pid,) = workers(child.pid)
         child.kill()
-        until(lambda: not os.path.exists(f"/proc/{pid}"), AT_ONCE)
+        assert ended(pid)
     assert list(temporary.iterdir()) == []
 
 
