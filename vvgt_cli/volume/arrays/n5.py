@@ -224,7 +224,7 @@ def _axes(array: N5Array) -> list[Axis]:
     for name, unit, step, start, size in zip(names, units, scale, shift, array.shape, strict=True):
         role = name.lower() if name.lower() in ("x", "y", "z", "t", "c") else ""
         centres = start + step * np.arange(size) if role in ("x", "y", "z") and size <= 1 << 24 else None
-        axes.append(Axis(name, size, centres, unit, role))
+        axes.append(Axis(name, size, centres, unit, role, step=abs(step)))
     return axes
 
 
