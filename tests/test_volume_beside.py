@@ -170,3 +170,7 @@ def test_flags_and_enumerations_are_labels(tmp_path: Path, form: str) -> None:
     for stored in (False, True):
         segments = read_volume(str(path), ReadOptions(stored=stored)).segments
         assert {one.name.replace("_", " "): one.number for one in segments} == names
+    if form == "nc":  # of bits
+        with netCDF4.Dataset(path, "a") as file:
+            file["kind"].flag_masks = np.arange(3, dtype="u1")
+        assert read_volume(str(path)).segments is None

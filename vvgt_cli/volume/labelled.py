@@ -33,7 +33,7 @@ from vvgt_cli.volume.space import metres, unit_name
 EVEN = 0.01  # of a step that a coordinate may be off and still count as evenly spaced (float32 longitudes are)
 AXIS_ATTRIBUTES = ("axis", "standard_name", "units", "positive", "_CoordinateZisPositive")
 MARKS = ("_FillValue", "missing_value", "valid_min", "valid_max", "valid_range")
-NAMING = ("long_name", "standard_name", "units", "flag_values", "flag_meanings")  # of the values
+NAMING = ("long_name", "standard_name", "units", "flag_values", "flag_meanings", "flag_masks")  # of the values
 CF_ATTRIBUTES = (
     *("scale_factor", "add_offset", "_FillValue", "missing_value"),
     *("valid_min", "valid_max", "valid_range", "_Unsigned"),
@@ -368,7 +368,8 @@ def _named(volume: Volume, attributes: Mapping[str, Any], time: tuple[float, str
     """Return the volume with its time, and name, unit and labels that attributes give its values, as CF has them."""
     long, standard, unit = (printable(text_of(attributes.get(key, ""))).strip()[:40] for key in NAMING[:3])
     bare = unit in ("1", "none", "unitless", "dimensionless")
-    flags = {"flag_values", "flag_meanings"} <= attributes.keys() and (volume.slope, volume.intercept) == (1, 0)
+    flags = {"flag_values", "flag_meanings"} <= attributes.keys() and "flag_masks" not in attributes  # bits
+    flags = flags and (volume.slope, volume.intercept) == (1, 0)
     segments = segments_in(lambda: _flags(attributes), source) if flags else None
     return replace(volume, quantity=long or standard, value_unit="" if bare else unit, time=time, segments=segments)
 
