@@ -275,3 +275,12 @@ def test_a_conversion_says_nothing_unless_asked(field, capfd):
     assert capfd.readouterr() == ("", "")
     vvgt.convert(field, TF, max_gaussians=50, screen=32, steps=0, progress=True)
     assert "closed form" in capfd.readouterr().err
+
+
+def test_a_dataset_of_xarray_and_curvilinear_places(field):
+    at = {"z": 2.0 * np.arange(field.shape[0]), "lon": (("y", "x"), field[0]), "lat": (("y", "x"), field[0])}
+    dataset = xarray.Dataset({"a": (("z", "y", "x"), field), "b": (("z", "y", "x"), -field)}, at)
+    with pytest.warns(UserWarning, match=r"curvilinear \(lon, lat\), which is not read"):
+        assert np.array_equal(vvgt.read_volume(dataset, array="b").data, -field)
+    with pytest.raises(vvgt.UsageError, match=r"several variables: a .*; b"):
+        vvgt.read_volume(dataset)

@@ -1,6 +1,7 @@
 """Coordinates that lie beside an array whose axes nothing states, and arrays of particles, which lie on no grid."""
 
 import json
+import warnings
 from pathlib import Path
 
 import h5py
@@ -130,3 +131,46 @@ def test_frames_of_velox_are_time_steps(tmp_path: Path, blocks: bool) -> None:
     volume = read_volume(path, ReadOptions(time=2, stored=blocks))
     np.testing.assert_array_equal(volume.data[:][0], frames[:, :, 2])
     np.testing.assert_allclose((*volume.spacing[:2], volume.unit == "m"), (2e-10, 5e-10, 1))
+
+
+@pytest.mark.parametrize("form", ["h5", "npz", "zarr"])
+def test_places_in_forms_that_are_not_read_are_named(tmp_path: Path, form: str) -> None:
+    path = write(tmp_path, form, {"field": VALUES, "voxel_size": np.array([0.3]), "affine": np.eye(4)})
+    with pytest.warns(UserWarning, match="taken as 1; beside it lie, in forms that are not read, (v|a)"):
+        assert read_volume(path).spacing == (1, 1, 1)
+    placed = write(tmp_path, form, {"field": VALUES, "voxel_size": np.array([0.3]), **LINES})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_grid(read_volume(placed))
+
+
+def test_xdmf_beside_hdf5_is_named(tmp_path: Path) -> None:
+    path = write(tmp_path, "h5", {"field": VALUES})
+    (tmp_path / "v.xdmf").write_text("<Xdmf/>")
+    with pytest.warns(UserWarning, match=r"states no spacing, which is taken as 1; v\.xdmf may: give that file"):
+        read_volume(path)
+
+
+@pytest.mark.parametrize("form", ["nc", "enum.nc", "h5"])
+def test_flags_and_enumerations_are_labels(tmp_path: Path, form: str) -> None:
+    values, names = np.arange(60).reshape(3, 4, 5) % 3, {"air": 0, "sea ice": 1, "land": 2}
+    path = tmp_path / f"v.{form}"
+    if form == "h5":
+        with h5py.File(path, "w") as file:
+            file.create_dataset("kind", data=values.astype("u1"), dtype=h5py.enum_dtype(names, basetype="u1"))
+    else:
+        with netCDF4.Dataset(path, "w") as file:
+            for name, size in zip("zyx", values.shape, strict=True):
+                file.createDimension(name, size)
+            plain = {name.replace(" ", "_"): number for name, number in names.items()}
+            kind = file.createEnumType("u1", "kinds", plain) if "enum" in form else "u1"
+            file.createVariable("kind", kind, ("z", "y", "x"))[:] = values.astype("u1")
+            if "enum" not in form:
+                file["kind"].setncatts({"flag_values": np.arange(3, dtype="u1"), "flag_meanings": " ".join(plain)})
+    for stored in (False, True):
+        segments = read_volume(str(path), ReadOptions(stored=stored)).segments
+        assert {one.name.replace("_", " "): one.number for one in segments} == names
+    if form == "nc":  # of bits
+        with netCDF4.Dataset(path, "a") as file:
+            file["kind"].flag_masks = np.arange(3, dtype="u1")
+        assert read_volume(str(path)).segments is None

@@ -13,6 +13,7 @@ import SimpleITK as sitk
 import zarr
 
 from tests.ramps import X, Y, Z, check_grid, ramp
+from tests.refused import refused
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume import ReadOptions, Volume, read_volume
 from vvgt_cli.volume.space import one_unit
@@ -347,3 +348,67 @@ def test_decimal_commas_are_never_half_a_number(tmp_path: Path, name: str, field
 def test_commas_between_numbers_are_separators(tmp_path: Path, field: str) -> None:
     (tmp_path / "v.mha").write_bytes(DECIMALS["v.mha"].format(field).encode() + COUNT.astype("u1").tobytes())
     assert read_volume(str(tmp_path / "v.mha")).spacing == (1, 1, 2)
+
+
+@pytest.mark.parametrize("form", ["openpmd", "fiji", "ilastik", "dream3d", "ome"])
+def test_one_slice_is_as_thick_as_its_file_states(tmp_path: Path, form: str) -> None:
+    flat, sizes = ramp(X, Y, Z[:1]), [2.0, 0.5, 0.25]
+    path = tmp_path / "v.h5"
+    if form == "ome":
+        group = zarr.open_group(str(tmp_path / "v.zarr"), mode="w", zarr_format=2)
+        group.create_array("0", data=flat)
+        units = {"z": "micrometer", "y": "millimeter", "x": "millimeter"}
+        scale = {"type": "scale", "scale": [2000.0, 0.5, 0.25]}
+        level = {"path": "0", "coordinateTransformations": [scale]}
+        axes = [{"name": name, "type": "space", "unit": unit} for name, unit in units.items()]
+        group.attrs["multiscales"] = [{"version": "0.4", "axes": axes, "datasets": [level]}]
+        path = tmp_path / "v.zarr"
+    elif form == "openpmd":
+        openpmd(path)
+        with h5py.File(path, "r+") as file:
+            del file["data/100/meshes/E/x"]
+            file["data/100/meshes/E/x"] = flat
+    else:
+        with h5py.File(path, "w") as file:
+            data = file.create_dataset("c/cells/v", data=flat)
+            tags = [{"key": key, "resolution": step} for key, step in zip("zyx", sizes, strict=True)]
+            data.attrs.update({"fiji": {"element_size_um": sizes}, "ilastik": {"axistags": json.dumps({"axes": tags})}}
+                              .get(form, {}))  # fmt: skip
+            file.update({"c/_SIMPL_GEOMETRY/SPACING": sizes[::-1], "c/_SIMPL_GEOMETRY/ORIGIN": [0.0] * 3}
+                        if form == "dream3d" else {})  # fmt: skip
+    where = f"{path}:/c/cells/v" if form == "dream3d" else str(path)
+    np.testing.assert_allclose(read_volume(where).spacing, (0.25, 0.5, 2.0))
+
+
+@pytest.mark.parametrize("kind", ["affine", "rotation", "scale"])
+def test_transformations_of_ome_zarr_that_are_not_read_are_refused(tmp_path: Path, kind: str) -> None:
+    store = str(tmp_path / "v.zarr")
+    group = zarr.open_group(store, mode="w", zarr_format=2)
+    group.create_array("0", data=COUNT)
+    step = {"type": kind, "path": "elsewhere"} if kind == "scale" else {"type": kind, kind: np.eye(3).tolist()}
+    axes = [{"name": name, "type": "space"} for name in "zyx"]
+    level = {"path": "0", "coordinateTransformations": [{"type": "identity"}, step]}
+    group.attrs["multiscales"] = [{"version": "0.4", "axes": axes, "datasets": [level]}]
+    refused(UsageError, f"a transformation .*{kind}.*; expected scale and translation .*--spacing", read_volume, store)
+    assert read_volume(store, ReadOptions(spacing=(1, 2, 3))).spacing == (1, 2, 3)
+
+
+def test_times_of_ome_zarr(tmp_path: Path) -> None:
+    group = zarr.open_group(str(tmp_path / "v.zarr"), mode="w", zarr_format=2)
+    group.create_array("0", data=np.stack([COUNT, COUNT + 1]))
+    axes = [{"name": "t", "type": "time", "unit": "second"}, *({"name": n, "type": "space"} for n in "zyx")]
+    level = {"path": "0", "coordinateTransformations": [{"type": "scale", "scale": [2.5, 1, 1, 1]}]}
+    group.attrs["multiscales"] = [{"version": "0.4", "axes": axes, "datasets": [level]}]
+    assert read_volume(str(tmp_path / "v.zarr"), ReadOptions(time=1)).time == (2.5, "second")
+
+
+def test_units_that_are_not_known_are_said(tmp_path: Path) -> None:
+    axes = {"x": X, "y": Y, "z": Z}
+    with netCDF4.Dataset(tmp_path / "v.nc", "w") as file:
+        for name, centres in axes.items():
+            file.createDimension(name, len(centres))
+            file.createVariable(name, "f8", (name,))[:] = centres
+            file[name].units = "parsec"
+        file.createVariable("t", "f4", ("z", "y", "x"))[:] = ramp(X, Y, Z)
+    with pytest.warns(UserWarning, match="unit 'parsec' is not a known unit of length; numbers are kept"):
+        check_grid(read_volume(str(tmp_path / "v.nc")))

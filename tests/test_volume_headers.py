@@ -328,3 +328,10 @@ def test_vgi_lies(tmp_path: Path, old: str, new: str, message: str) -> None:
     (tmp_path / "v.vol").write_bytes(b"xx" + VALUES.tobytes())
     assert old in VGI
     refused(DataError, message, read_volume, write(tmp_path / "v.vgi", VGI.replace(old, new).encode()))
+
+
+def test_nrrd_quantized_values_are_said_and_their_unit_is_read(tmp_path: Path) -> None:
+    fields = {"old min": -1000, "old max": 3000, "sample units": '"HU"'}
+    with pytest.warns(UserWarning, match="old min and old max are not applied to its quantized values"):
+        volume = read_volume(write(tmp_path / "v.nrrd", nrrd(fields, VALUES.tobytes())))
+    assert volume.value_unit == "HU"

@@ -412,3 +412,54 @@ def test_places_with_different_numbers_of_images(tmp_path: Path) -> None:
     next(iter(sorted(tmp_path.iterdir()))).unlink()
     with pytest.raises(DataError, match="11 images in 4 places, 2 to 3 in each, and no attribute tells volumes apart"):
         read_volume(str(tmp_path))
+
+
+def real_world(slope: float, intercept: float, unit: str) -> Dataset:
+    mapping, code = Dataset(), Dataset()
+    mapping.RealWorldValueSlope, mapping.RealWorldValueIntercept = slope, intercept
+    code.CodeValue, code.CodingSchemeDesignator, code.CodeMeaning = unit, "UCUM", unit
+    mapping.MeasurementUnitsCodeSequence = [code]
+    return mapping
+
+
+@pytest.mark.parametrize("rescale", [{}, {"RescaleSlope": 1, "RescaleIntercept": 0, "RescaleType": "US"}])
+def test_real_world_values_where_no_other_scale_is_stated(tmp_path: Path, rescale: dict) -> None:
+    mapping = [real_world(0.5, 3.0, "mm2/s")]
+    volume = read_volume(series(tmp_path, [{}], RealWorldValueMappingSequence=mapping, **rescale))
+    np.testing.assert_array_equal(volume.data * volume.slope + volume.intercept, STACK * 0.5 + 3)
+    assert (volume.value_unit, volume.hounsfield) == ("mm2/s", False)
+
+
+def test_real_world_values_beside_another_scale_are_said(tmp_path: Path) -> None:
+    told = {"RealWorldValueMappingSequence": [real_world(0.5, 3.0, "mm2/s")], "RescaleSlope": 2, "RescaleIntercept": 1}
+    with pytest.warns(UserWarning, match="its RealWorldValueMapping is not applied, but its rescale slope"):
+        volume = read_volume(series(tmp_path, [{}], **told))
+    assert (volume.slope, volume.intercept, volume.value_unit) == (2, 1, "")
+
+
+def test_parametric_maps_as_in_highdicom(tmp_path: Path) -> None:
+    import highdicom
+    from highdicom.pm import ParametricMap, RealWorldValueMapping
+    from pydicom.sr.codedict import codes
+
+    unit = codes.UCUM.NoUnits
+    mapping = RealWorldValueMapping("a", "b", unit=unit, value_range=(0, 255), slope=0.5, intercept=3.0)
+    asked = {"PatientName": "", "PatientBirthDate": "", "PatientSex": "", "StudyID": "", "StudyDate": "",
+             "StudyTime": "", "AccessionNumber": "", "ReferringPhysicianName": "", "FrameOfReferenceUID": "1.2.9",
+             "PositionReferenceIndicator": "", "InstanceNumber": 1}  # fmt: skip
+    source = [image(plane, (0, 0, 2 * k), SOPInstanceUID=f"1.2.{k}", **asked) for k, plane in enumerate(STACK)]
+    who = {"manufacturer": "m", "manufacturer_model_name": "n", "software_versions": "1", "device_serial_number": "1"}
+    made = ParametricMap(
+        source, STACK.astype("u2"), "1.2.7", 2, "1.2.8", 1, contains_recognizable_visual_features=False,
+        real_world_value_mappings=[mapping], window_center=1, window_width=2, **who,
+    )  # fmt: skip
+    made.save_as(tmp_path / "v.dcm")
+    volume = read_volume(str(tmp_path / "v.dcm"))
+    theirs = highdicom.imread(tmp_path / "v.dcm").get_volume().array
+    np.testing.assert_array_equal(volume.data * volume.slope + volume.intercept, STACK * 0.5 + 3)
+    assert sorted(theirs.ravel()) == sorted((STACK * 0.5 + 3).ravel())
+
+
+def test_values_in_the_high_bits_are_refused(tmp_path: Path) -> None:
+    path = series(tmp_path, [{}], BitsStored=12, HighBit=15)
+    refused(DataError, "HighBit 15 with BitsStored 12; expected 11", read_volume, path)

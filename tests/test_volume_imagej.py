@@ -158,3 +158,29 @@ def test_planes_that_only_images_counts(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_volume(str(path)).data, values)
     path.write_bytes(body.replace(b"slices=4", b"sliced=4").replace(b"images=4", b"images=6"))
     refused(DataError, r"6 images that are not there \(120 bytes are missing\)", read_volume, str(path))
+
+
+SIGNED = {"axes": "ZYX", "cf": 0, "c0": -32768.0, "c1": 1.0, "vunit": "Gray Value"}
+
+
+@pytest.mark.parametrize("sliced", [False, True])
+def test_calibrated_values(tmp_path: Path, sliced: bool) -> None:
+    signed = VALUES[0, 0].astype("i4") - 100
+    facts = [SIGNED, {**SIGNED, "c0": -16484.0, "c1": 0.5, "vunit": "HU"}]
+    for how, unit in zip(facts, ("", "HU"), strict=True):
+        stored = ((signed - how["c0"]) / how["c1"]).astype("u2")
+        for k, part in enumerate(stored if sliced else [stored]):
+            form = {**how, "axes": "YX"} if sliced else how
+            tifffile.imwrite(tmp_path / f"v{k}.tif", part, imagej=True, metadata=form)
+        volume = read_volume(str(tmp_path if sliced else tmp_path / "v0.tif"))
+        np.testing.assert_array_equal(volume.data * volume.slope + volume.intercept, signed)
+        assert volume.value_unit == unit
+    if sliced:
+        tifffile.imwrite(tmp_path / "v2.tif", stored[2], imagej=True, metadata={**SIGNED, "axes": "YX"})
+        refused(DataError, r"v2\.tif: calibrated values of another scale than those of v0", read_volume, str(tmp_path))
+
+
+def test_other_calibrations_are_said(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "v.tif", VALUES[0, 0], imagej=True, metadata={**SIGNED, "cf": 1, "c2": 3.0})
+    with pytest.warns(UserWarning, match="not calibrated as ImageJ's function 1 says"):
+        np.testing.assert_array_equal(read_volume(str(tmp_path / "v.tif")).data, VALUES[0, 0])

@@ -90,3 +90,19 @@ def test_components_of_what_simpleitk_writes(tmp_path: Path, suffix: str) -> Non
         if suffix == ".mha":  # VTK 9.7 takes the second axis of such a NRRD file for x
             theirs = vtk_to_numpy(vtk_image(path).GetPointData().GetScalars()).reshape(values.shape)
             np.testing.assert_array_equal(ours.data, theirs[..., component])
+
+
+@pytest.mark.parametrize("components", [1, 3])
+def test_hdf5_of_itk_lies_where_its_metaimage_does(tmp_path: Path, components: int) -> None:
+    values = np.random.default_rng(0).random((2, 3, 4, components))
+    image = sitk.GetImageFromArray(values if components > 1 else values[..., 0], isVector=components > 1)
+    image.SetSpacing((0.5, 0.6, 2.0))
+    image.SetOrigin((1.0, 2.0, 3.0))
+    image.SetDirection((0.36, 0.48, -0.8, -0.8, 0.6, 0.0, 0.48, 0.64, 0.6))
+    how = ReadOptions(component=components - 1) if components > 1 else ReadOptions()
+    for name in ("v.h5", "v.mha"):
+        sitk.WriteImage(image, str(tmp_path / name))
+    ours, theirs = (read_volume(str(tmp_path / name), how) for name in ("v.h5", "v.mha"))
+    np.testing.assert_array_equal(ours.data, values[..., -1])
+    np.testing.assert_allclose(ours.affine, theirs.affine, atol=1e-12)
+    assert ours.space == theirs.space == "RAS"

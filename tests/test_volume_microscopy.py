@@ -209,6 +209,12 @@ def test_n5_levels_and_what_is_refused(vvgt, store: Path, tmp_path: Path) -> Non
     assert level_shapes(str(tmp_path / "p.n5"), ReadOptions()) == [(7, 9, 11)] * 2
     coarse = read_volume(str(tmp_path / "p.n5"), ReadOptions(level=1))
     assert (coarse.spacing, coarse.origin) == ((1.0, 2.0, 2.0), (0.25, 0.5, 0.0))
+    del told["downsamplingFactors"]
+    for key in ("scales", "downsamplingFactors"):  # of all levels, by their group
+        facts.write_text(json.dumps(told | {"offset": [10, 20, 30]}))
+        (tmp_path / "p.n5" / "attributes.json").write_text(json.dumps({key: [[1, 1, 1], [2, 2, 1]]}))
+        coarse = read_volume(str(tmp_path / "p.n5"), ReadOptions(level=1))
+        assert (coarse.spacing, coarse.origin) == ((1.0, 2.0, 2.0), (10.25, 20.5, 30.0))
     block = store / "raw" / "0" / "0" / "0"
     block.write_bytes(block.read_bytes()[:-4])
     refused(DataError, r"its .4, 4, 4. values need 256", read_volume, f"{store}:/raw")

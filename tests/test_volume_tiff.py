@@ -345,3 +345,13 @@ def test_info_and_a_series_of_one_file(vvgt, tmp_path: Path) -> None:
     assert told["choices"][1]["range"] == [VALUES[0, 1].min(), VALUES[0, 1].max()]
     assert "2 channels (0 'DAPI', 1 'GFP')" in vvgt("init", source, "--time", 0, "--tf", "hot", "-o", "a.ply").error
     assert json.loads(vvgt("info", source, "--channel", "1", "--json").out)["time_steps"] == 3
+
+
+def test_sizes_and_missing_values_in_other_tags_are_said(tmp_path: Path) -> None:
+    tags = [(42113, "s", 0, "-9999", True), (33550, "d", 3, (30.0, 30.0, 0.0), True)]
+    tifffile.imwrite(tmp_path / "v.tif", np.ones((3, 4, 5), "f4"), photometric="minisblack", extratags=tags)
+    with (
+        pytest.warns(UserWarning, match=r"sizes in ModelPixelScale are not read; --spacing X Y Z sets them"),
+        pytest.warns(UserWarning, match=r"voxels of -9999 \(GDAL_NODATA\) are read as values, not as missing"),
+    ):
+        read_volume(str(tmp_path / "v.tif"))

@@ -26,7 +26,7 @@ from vvgt_cli.look.label_files import table_of
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.volume import ReadOptions, Volume
-from vvgt_cli.volume.arrays.beside import Neighbour, with_neighbours
+from vvgt_cli.volume.arrays.beside import Neighbour, choose_grid, warn_of_curvilinear, with_neighbours
 from vvgt_cli.volume.components import contiguous
 from vvgt_cli.volume.dask_arrays import Chunks, is_dask, lazy
 from vvgt_cli.volume.labelled import axis, labelled_volume
@@ -398,8 +398,12 @@ def _refuse(given: Sequence[str], why: str) -> None:
 
 def _labelled(data: Any, options: ReadOptions, name: str) -> Volume:
     """Read an xarray.DataArray; one of Dask block by block, or as a whole for a magnitude or another grid."""
+    if hasattr(data, "data_vars"):  # a Dataset
+        grids = {str(key): (one.shape, one.dtype.name) for key, one in data.data_vars.items()}
+        data = data[choose_grid(grids, options.array, name, "variable")]
     axes = [axis(str(dim), size) for dim, size in zip(data.dims, data.shape, strict=True)]
     label = str(data.name or name)
+    warn_of_curvilinear([str(key) for key, one in data.coords.items() if one.ndim > 1], label)
     beside = {
         str(key): Neighbour.of(one.shape, lambda one=one: (one.values, one.attrs), str(one.dims[0]))
         for key, one in data.coords.items()

@@ -17,13 +17,23 @@ import numpy as np
 from vvgt_cli.errors import DataError, SeveralComponents, SeveralSteps, UsageError
 from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory
 from vvgt_cli.volume.components import contiguous, listed, select_component
-from vvgt_cli.volume.reading import ReadOptions, Stored, Volume, float_dtype, printable, text_of, triple
+from vvgt_cli.volume.reading import (
+    ReadOptions,
+    Segment,
+    Stored,
+    Volume,
+    float_dtype,
+    printable,
+    segments_in,
+    text_of,
+    triple,
+)
 from vvgt_cli.volume.space import metres, unit_name
 
 EVEN = 0.01  # of a step that a coordinate may be off and still count as evenly spaced (float32 longitudes are)
 AXIS_ATTRIBUTES = ("axis", "standard_name", "units", "positive", "_CoordinateZisPositive")
 MARKS = ("_FillValue", "missing_value", "valid_min", "valid_max", "valid_range")
-NAMING = ("long_name", "standard_name", "units")  # of the values
+NAMING = ("long_name", "standard_name", "units", "flag_values", "flag_meanings", "flag_masks")  # of the values
 CF_ATTRIBUTES = (
     *("scale_factor", "add_offset", "_FillValue", "missing_value"),
     *("valid_min", "valid_max", "valid_range", "_Unsigned"),
@@ -57,6 +67,7 @@ class Axis:
         role: ``x``, ``y``, ``z``, ``t``, ``c`` (channels), or "" where nothing says.
         labels: names of channels, where there are any.
         colors: RGB of channels, where there are any.
+        step: distance between values where the file states it even of a single one; 0 where it does not.
     """
 
     name: str
@@ -66,6 +77,7 @@ class Axis:
     role: str = ""
     labels: tuple[str, ...] = ()
     colors: tuple[tuple[float, float, float] | None, ...] = ()
+    step: float = 0.0
 
     def __str__(self) -> str:
         """Describe the axis in a message."""
@@ -98,6 +110,17 @@ def axis(name: str, size: int, centres: np.ndarray | None = None, attributes: Ma
     if role == "z" and centres is not None and _points_down(stated, words, centres):
         centres = -np.asarray(centres, np.float64) + 0.0
     return Axis(name, size, centres, units, role)
+
+
+def even_axis(
+    name: str, size: int, first: float, step: float, attributes: Mapping[str, Any] | None = None, role: str = ""
+) -> Axis:
+    """Make an axis of evenly spaced values, whose step is known even if there is only one value; else as `axis`."""
+    line = axis(name, max(size, 2), first + step * np.arange(max(size, 2)), attributes)
+    if line.centres is None:
+        return line
+    one_step = float(abs(line.centres[1] - line.centres[0]))
+    return replace(line, size=size, centres=line.centres[:size], role=role or line.role, step=one_step)
 
 
 def _points_down(stated: Mapping[str, str], words: Sequence[str], centres: np.ndarray) -> bool:
@@ -176,7 +199,8 @@ def labelled_volume(
         field = np.transpose(values, order)
     if field.ndim == 2:
         field, spatial = field[None], [Axis("", 1), *spatial]
-    return _named(_placed(field, spatial, (slope, intercept), options, source, name), attributes, _time(axes, options))
+    volume = _placed(field, spatial, (slope, intercept), options, source, name)
+    return _named(volume, attributes, _time(axes, options), source)
 
 
 def _warn_of_unread(axes: Sequence[Axis], attributes: Mapping[str, Any], options: ReadOptions, source: str) -> None:
@@ -340,11 +364,26 @@ def _time(axes: Sequence[Axis], options: ReadOptions) -> tuple[float, str] | Non
     return next(((float(a.centres[options.time or 0]), a.units) for a in stated if a.centres is not None), None)
 
 
-def _named(volume: Volume, attributes: Mapping[str, Any], time: tuple[float, str] | None) -> Volume:
-    """Return the volume with its time, and the name and unit that attributes give its values, as CF has them."""
-    long, standard, unit = (printable(text_of(attributes.get(key, ""))).strip()[:40] for key in NAMING)
+def _named(volume: Volume, attributes: Mapping[str, Any], time: tuple[float, str] | None, source: str) -> Volume:
+    """Return the volume with its time, and name, unit and labels that attributes give its values, as CF has them."""
+    long, standard, unit = (printable(text_of(attributes.get(key, ""))).strip()[:40] for key in NAMING[:3])
     bare = unit in ("1", "none", "unitless", "dimensionless")
-    return replace(volume, quantity=long or standard, value_unit="" if bare else unit, time=time)
+    flags = {"flag_values", "flag_meanings"} <= attributes.keys() and "flag_masks" not in attributes  # bits
+    flags = flags and (volume.slope, volume.intercept) == (1, 0)
+    segments = segments_in(lambda: _flags(attributes), source) if flags else None
+    return replace(volume, quantity=long or standard, value_unit="" if bare else unit, time=time, segments=segments)
+
+
+def _flags(attributes: Mapping[str, Any]) -> list[Segment]:
+    """Return the labels of CF's flags (3.5), words with _ for blanks, or of an enumeration, which are a list."""
+    words, numbers = attributes["flag_meanings"], np.ravel(attributes["flag_values"])
+    names = words if isinstance(words, list) else [word.replace("_", " ") for word in text_of(words).split()]
+    return [Segment(int(number), name) for number, name in zip(numbers, names, strict=True)]
+
+
+def flags_of(names: Mapping[str, int] | None) -> dict[str, Any]:
+    """Return an enumeration's names and values as attributes; none where there is no enumeration."""
+    return {"flag_values": list(names.values()), "flag_meanings": list(names)} if names else {}
 
 
 def _placed(
@@ -360,11 +399,14 @@ def _placed(
     ]
     try:
         last = next((_unit(a) for a in reversed(axes) if a.size > 1), "")
-        centres, unit = _one_unit(axes, source), unit_name(metres(last))
+        axes, unit = _one_unit(axes, source), unit_name(metres(last))
     except UsageError:
         if options.spacing is None:
             raise
-        centres, unit = [None] * 3, ""
+        axes, unit = [replace(a, centres=None, step=0.0) for a in axes], ""
+    centres = [a.centres for a in axes]
+    if options.spacing is None and last not in ("", "1", "degrees", "level") and metres(last) is None:
+        warnings.warn(f"{source}: unit {last!r} is not a known unit of length; numbers are kept", stacklevel=4)
     bare = [a.name or "unnamed" for a, c in zip(axes, centres, strict=True) if c is None and a.size > 1]
     if options.spacing is None and bare and any(c is not None and c.size > 1 for c in centres):
         warnings.warn(f"{source}: no coordinates along {', '.join(bare)}; its step is taken as 1", stacklevel=4)
@@ -373,8 +415,9 @@ def _placed(
         if options.dims is not None:
             why = "--spacing says where the values are" if options.spacing else "its axes are evenly spaced"
             raise UsageError(f"{source}: {why}; leave out --dims")
-        steps = [1.0 if c is None or c.size < 2 else float((c[-1] - c[0]) / (c.size - 1)) for c in centres]
-        if field.shape[0] == 1 and (centres[0] is None or centres[0].size < 2):
+        steps = [a.step or 1.0 if c is None or c.size < 2 else float((c[-1] - c[0]) / (c.size - 1))
+                 for a, c in zip(axes, centres, strict=True)]  # fmt: skip
+        if field.shape[0] == 1 and not axes[0].step:
             steps[0] = steps[2]  # a single slice is as thick as its pixels are wide
         step = options.spacing or triple(steps[::-1])
         return Volume(field, step, origin, name=name, slope=scaling[0], intercept=scaling[1], unit=unit)
@@ -423,7 +466,7 @@ def _left(
 
     field: Any = Stored(read, final, tuple(axes[k].size for k in zyx), [chunks[k] for k in zyx], source)
     volume = _placed(field, [axes[k] for k in zyx], (1.0, 0.0) if wide else scale, options, source, name)
-    return _named(volume, attributes, _time(axes, options))
+    return _named(volume, attributes, _time(axes, options), source)
 
 
 def _descends(a: Axis, source: str) -> bool:
@@ -449,16 +492,20 @@ def _steps(a: Axis) -> str:
     return f"axis {a.name or 'unnamed'} has steps from {steps.min():g} to {steps.max():g}"
 
 
-def _one_unit(axes: Sequence[Axis], source: str) -> list[np.ndarray | None]:
-    """Return the coordinates of the axes, lengths in the unit of the last; raise UsageError if units do not compare."""
+def _one_unit(axes: Sequence[Axis], source: str) -> list[Axis]:
+    """Return the axes with lengths in the unit of the last; raise UsageError if units do not compare."""
     units = [_unit(a) for a in axes if a.size > 1]
-    if len(set(units)) <= 1:
-        return [a.centres for a in axes]
-    if all(metres(u) for u in units):
-        base = metres(units[-1]) or 1.0
-        return [None if a.centres is None else a.centres * ((metres(_unit(a)) or base) / base) for a in axes]
-    stated = ", ".join(f"{a.name or 'unnamed'} in {_unit(a) or 'no unit'}" for a in reversed(axes) if a.size > 1)
-    raise UsageError(f"{source}: axes {stated}; expected one unit of length: try --spacing X Y Z")
+    base = metres(units[-1]) if units else None
+    if len(set(units)) > 1 and not all(metres(u) for u in units):
+        stated = ", ".join(f"{a.name or 'unnamed'} in {_unit(a) or 'no unit'}" for a in reversed(axes) if a.size > 1)
+        raise UsageError(f"{source}: axes {stated}; expected one unit of length: try --spacing X Y Z")
+    if base is None:
+        return list(axes)
+    factors = [(metres(_unit(a)) or base) / base for a in axes]
+    return [
+        replace(a, centres=None if a.centres is None else a.centres * factor, step=a.step * factor)
+        for a, factor in zip(axes, factors, strict=True)
+    ]
 
 
 def _unit(a: Axis) -> str:

@@ -13,13 +13,14 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.labelled import Axis, axis, even
+from vvgt_cli.volume.labelled import GEOMETRY, Axis, axis, even, even_axis
 from vvgt_cli.volume.reading import choose, listed, metres, text_of
 
 GROUPS = re.compile(r"coord(inate)?s?|grid|axes|mesh|dim(ension)?s?", re.I)  # that hold coordinates
 _LETTER = re.compile(r"(?:(?:coord(?:inate)?s?|grid|axis)_?)?([xyzt])[ _([]*(\w*)[)\]]*", re.I)
 _SUFFIXES = re.compile(r"|s|c|v|ax(?:is|es)|grid|(?:coord(?:inate)?|cent(?:er|re)|value|val|pos(?:ition)?)s?", re.I)
 _NUMBERED = re.compile(r"(?:dim|axis|coord)_?(\d)", re.I)
+_GEOMETRY = {re.sub("_", "", word.lower()) for word in GEOMETRY}
 _PLACES = re.compile(r"(?:particles?_?)?(?:coord(?:inate)?s?|pos(?:ition)?s?|xyz)", re.I)
 _VECTORS = re.compile(r"(?:particles?_?)?(?:vel(?:ocity|ocities)?|accelerations?|forces?|moment(?:um|a))", re.I)
 
@@ -61,7 +62,8 @@ def with_neighbours(
         return axes
     if (numbered := _numbered(axes, beside)) is not None:
         return numbered
-    fits = {name: one for name, one in beside.items() if any(_lies_along(one, a) for a in axes)}
+    unread = [name for name in beside if re.sub("_|s$", "", name.rpartition("/")[2].lower()) in _GEOMETRY]
+    fits = {name: one for name, one in beside.items() if name not in unread and any(_lies_along(one, a) for a in axes)}
     some = {name: _read(name, one) for name, one in itertools.islice(fits.items(), 50)}
     read = {name: a for name, a in some.items() if a.centres is not None}
     named = {role: [name for name, a in read.items() if a.role == role and _ascends(a)] for role in "tzyx"}
@@ -76,13 +78,24 @@ def with_neighbours(
     along: list[list[Any]] = [[read[way[k]].centres if k in way else None for k in range(len(axes))] for way in ways]
     if ways and all(np.array_equal(a, b) for way in along for a, b in zip(way, along[0], strict=True)):
         return [read[ways[0][k]] if k in ways[0] else a for k, a in enumerate(axes)]
-    if read:
-        steps = listed([f"{name} ({_step(a)})" for name, a in read.items()], ", ", 4)
+    if read or unread:
+        steps = [f"as long as its axes, {listed([f'{name} ({_step(a)})' for name, a in read.items()], ', ', 4)}"]
+        forms = [f"in forms that are not read, {listed(unread, ', ', 4)}"]
+        lie = "; ".join([*(steps if read else []), *(forms if unread else [])])
         warnings.warn(
-            f"{source}: states no spacing, which is taken as 1; beside it lie, as long as its axes, {steps}; --spacing "
-            "X Y Z sets it", stacklevel=3,
-        )  # fmt: skip
+            f"{source}: states no spacing, which is taken as 1; beside it lie, {lie}; --spacing X Y Z sets it",
+            stacklevel=3,
+        )
     return axes
+
+
+def warn_of_curvilinear(odd: Sequence[str], source: str) -> None:
+    """Warn where places are coordinates of two or more axes (CF, 5.2), named by ``odd``, which are not read."""
+    if odd:
+        warnings.warn(
+            f"{source}: its places are curvilinear ({', '.join(odd)}), which is not read: voxels lie on an even grid "
+            "of its axes (cdo remapbil or Resample in ParaView makes a regular one)", stacklevel=3,
+        )  # fmt: skip
 
 
 def _numbered(axes: Sequence[Axis], beside: Mapping[str, Neighbour]) -> list[Axis] | None:
@@ -96,8 +109,11 @@ def _numbered(axes: Sequence[Axis], beside: Mapping[str, Neighbour]) -> list[Axi
             return None
         values, attributes = one.read()
         unit = text_of(attributes.get("units", "")).strip("[]").replace("_", "")  # EMD: [n_m]
-        line = values if one.size == old.size else values[0] + np.arange(old.size) * (values[1] - values[0])
-        placed.append(axis(text_of(attributes.get("name", "")), old.size, line, {"units": unit}))
+        facts = text_of(attributes.get("name", "")), old.size
+        if one.size == old.size:
+            placed.append(axis(*facts, values, {"units": unit}))
+        else:
+            placed.append(even_axis(*facts, values[0], values[1] - values[0], {"units": unit}))
     return placed if all(a.size == 1 or _ascends(a) for a in placed) else None
 
 

@@ -9,13 +9,17 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.headers import text_of
-from vvgt_cli.volume.labelled import AXIS_ATTRIBUTES, CF_ATTRIBUTES, Axis, axis
+from vvgt_cli.volume.labelled import AXIS_ATTRIBUTES, CF_ATTRIBUTES, Axis, axis, even_axis
+from vvgt_cli.volume.reading import Volume, unit_rows
+
+_ITK = re.compile(r"/ITKImage/\d+")
 
 
 def coordinates_of(dataset: Any) -> tuple[np.ndarray, dict[str, Any]]:
@@ -39,6 +43,8 @@ def conventional_axes(file: Any, dataset: Any, source: str) -> tuple[list[Axis],
         axes, more = _nexus(group, dataset), _nexus_scaling(group, dataset.name.rpartition("/")[2])
     elif "_SIMPL_GEOMETRY/SPACING" in group.parent and len(dataset.shape) >= 3:
         axes = _dream3d(group.parent["_SIMPL_GEOMETRY"], dataset)
+    elif _ITK.fullmatch(group.name):
+        axes = _itk(group, dataset)
     elif view := re.fullmatch(r"/t\d+/(s\d+)/(\d+)/cells", dataset.name):
         return _bigdataviewer(file[view[1]], int(view[2]), dataset)
     elif re.fullmatch("/Data/Image/[^/]+/Data", dataset.name) and len(dataset.shape) == 3:
@@ -49,8 +55,27 @@ def conventional_axes(file: Any, dataset: Any, source: str) -> tuple[list[Axis],
         *outer, nz, ny, nx = dataset.shape
         axes = [Axis("", n) for n in outer]
         for name, n, step in zip("zyx", (nz, ny, nx), np.ravel(sizes).astype(np.float64), strict=True):
-            axes.append(Axis(name, n, step * np.arange(n), "um", name))
+            axes.append(even_axis(name, n, 0.0, step, {"units": "um"}))
     return (axes, more) if axes else None
+
+
+def _itk(group: Any, dataset: Any) -> list[Axis]:
+    """Return the axes of an image of ITK (HDF5ImageIO), whose facts are in the order x, y, z."""
+    steps, first = (np.ravel(group[key])[::-1] for key in ("Spacing", "Origin"))
+    spatial = [
+        even_axis(name, size, *place)
+        for name, size, *place in zip("tzyx"[-len(steps) :], dataset.shape, first, steps, strict=False)
+    ]
+    return [*spatial, *(Axis("components", n, role="c") for n in dataset.shape[len(steps) :])]
+
+
+def turned_by_itk(group: Any, volume: Volume) -> Volume:
+    """Return the volume in the anatomical space of ITK, if an image of it is in the group: an axis a row."""
+    if not _ITK.fullmatch(group.name):
+        return volume
+    axes, stated = np.eye(3), np.asarray(group["Directions"], np.float64)[:3, :3]
+    axes[: len(stated), : len(stated)] = stated
+    return replace(volume, direction=unit_rows(axes)[1], space="LPS")
 
 
 def _openpmd(dataset: Any, source: str) -> tuple[list[Axis], dict[str, Any]]:
@@ -75,7 +100,7 @@ def _openpmd(dataset: Any, source: str) -> tuple[list[Axis], dict[str, Any]]:
     order = slice(None, None, -1 if text_of(mesh.get("dataOrder", "C")) == "F" else 1)
     step, start = (spacing * unit)[order], ((offset + position * spacing) * unit)[order]
     axes = [
-        axis(label, size, first + each * np.arange(size), {"units": "m"})
+        even_axis(label, size, first, each, {"units": "m"})
         for label, size, first, each in zip(labels[order], dataset.shape, start, step, strict=True)
     ]
     return axes, {"scale_factor": dataset.attrs["unitSI"]} if "unitSI" in dataset.attrs else {}
@@ -104,7 +129,7 @@ def _bigdataviewer(setup: Any, level: int, dataset: Any) -> tuple[list[Axis], di
     """
     axes = []
     for name, size, factor in zip("zyx", dataset.shape, setup["resolutions"][level][::-1], strict=True):
-        axes.append(axis(name, size, (factor - 1) / 2 + factor * np.arange(size)))
+        axes.append(even_axis(name, size, (factor - 1) / 2, factor))
     unsigned = text_of(setup.attrs.get("dataType", "uint16")).startswith("uint")
     return axes, {"_Unsigned": "true"} if unsigned else {}
 
@@ -134,7 +159,7 @@ def _dream3d(geometry: Any, dataset: Any) -> list[Axis]:
     """Return the axes of cells of DREAM.3D, whose origin is a corner; spacing and origin are in the order x, y, z."""
     steps, first = (np.ravel(geometry[key])[::-1] for key in ("SPACING", "ORIGIN"))
     spatial = [
-        axis(name, size, start + step * (np.arange(size) + 0.5))
+        even_axis(name, size, start + step / 2, step)
         for name, size, start, step in zip("zyx", dataset.shape, first, steps, strict=False)
     ]
     return [*spatial, *(Axis("components", n, None, "", "c") for n in dataset.shape[3:])]
@@ -147,6 +172,7 @@ def _vigra(tags: Sequence[Any], dataset: Any) -> list[Axis]:
     axes = []
     for tag, size in zip(tags, dataset.shape, strict=True):
         name, step = str(tag.get("key", "")), float(tag.get("resolution") or 0.0)
-        centres = step * np.arange(size) if step > 0 and name in "xyz" else None
-        axes.append(Axis(name, size, centres, "", name if name in ("x", "y", "z", "t", "c") else ""))
+        placed = step > 0 and name in ("x", "y", "z")
+        role = name if name in ("x", "y", "z", "t", "c") else ""
+        axes.append(even_axis(name, size, 0.0, step) if placed else Axis(name, size, role=role))
     return axes

@@ -7,6 +7,7 @@ are applied.
 
 from __future__ import annotations
 
+import warnings
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ import numpy as np
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.arrays import MAX_CHUNK
 from vvgt_cli.volume.arrays.beside import GROUPS, Neighbour, choose_grid, with_neighbours
-from vvgt_cli.volume.arrays.conventions import conventional_axes, coordinates_of
+from vvgt_cli.volume.arrays.conventions import conventional_axes, coordinates_of, turned_by_itk
 from vvgt_cli.volume.blocks import data_file, load_block, size_text
 from vvgt_cli.volume.labelled import (
     CF_ATTRIBUTES,
@@ -26,6 +27,7 @@ from vvgt_cli.volume.labelled import (
     Axis,
     axis,
     described_by,
+    flags_of,
     labelled_volume,
 )
 from vvgt_cli.volume.libraries import need, read_part
@@ -66,11 +68,22 @@ def read_dataset(path: Path, options: ReadOptions) -> Volume:
         if not any(a.name or a.centres is not None for a in axes):
             axes, more = conventional_axes(file, dataset, source) or (axes, {})
             attributes |= more
+        attributes |= flags_of(h5py.check_enum_dtype(dataset.dtype))
         axes = with_neighbours(axes, _beside(h5py, dataset, path), source, options.spacing is not None)
+        _warn_of_xdmf(path, axes, options)
         chunks = dataset.chunks or dataset.shape
         if mapped is None and options.stored:
             stored = partial(read_part, path, dataset.name)
-        return labelled_volume(stored, dataset.dtype, axes, attributes, options, source, name, chunks)
+        volume = labelled_volume(stored, dataset.dtype, axes, attributes, options, source, name, chunks)
+        return turned_by_itk(dataset.parent, volume)
+
+
+def _warn_of_xdmf(path: Path, axes: list[Axis], options: ReadOptions) -> None:
+    """Warn where no coordinates are known and a file of XDMF, which states them, lies beside."""
+    files = [path.with_suffix(suffix) for suffix in (".xdmf", ".xmf")]
+    beside = [file.name for file in files if file.is_file()]
+    if beside and options.spacing is None and all(a.centres is None for a in axes):
+        warnings.warn(f"{path}: states no spacing, which is taken as 1; {beside[0]} may: give that file", stacklevel=3)
 
 
 def checked_dataset(h5py: Any, file: Any, path: Path, name: str) -> Any:

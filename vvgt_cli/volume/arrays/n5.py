@@ -11,6 +11,7 @@ import bz2
 import itertools
 import lzma
 import math
+import re
 import struct
 import zlib
 from collections.abc import Sequence
@@ -224,7 +225,7 @@ def _axes(array: N5Array) -> list[Axis]:
     for name, unit, step, start, size in zip(names, units, scale, shift, array.shape, strict=True):
         role = name.lower() if name.lower() in ("x", "y", "z", "t", "c") else ""
         centres = start + step * np.arange(size) if role in ("x", "y", "z") and size <= 1 << 24 else None
-        axes.append(Axis(name, size, centres, unit, role))
+        axes.append(Axis(name, size, centres, unit, role, step=abs(step)))
     return axes
 
 
@@ -244,12 +245,17 @@ def _transform(array: N5Array, n: int) -> tuple[list[str], list[str], list[float
         size, unit = size.get("dimensions"), [stated_unit] * 3
     spatial = min(n, 3)
     steps = _floats(size, spatial) or [1.0] * spatial
-    factors = _floats(facts.get("downsamplingFactors"), spatial) or [1.0] * spatial
+    level = int(array.place.name[1:]) if re.fullmatch(r"s\d{1,3}", array.place.name) else 0
+    levels = next((above[k] for k in ("scales", "downsamplingFactors") if isinstance(above.get(k), list)), [])
+    listed = levels[level] if level < len(levels) else None  # of all levels, by the group
+    factors = _floats(facts.get("downsamplingFactors", listed), spatial) or [1.0] * spatial
+    first = _floats(facts.get("offset"), spatial) or [0.0] * spatial
     named = _list(facts.get("axes"), n)  # fastest first, as the sizes
     names = [str(a) for a in named] if named else ["x", "y", "z", *[""] * n][:n]
     units = [str(u or "") for u in _list(unit, spatial)] or [""] * spatial
     rest = n - spatial
-    shift = [s * (f - 1) / 2 for s, f in zip(steps, factors, strict=True)]  # a mean of voxels lies in their middle
+    # a mean of voxels lies in their middle
+    shift = [s * (f - 1) / 2 + at for s, f, at in zip(steps, factors, first, strict=True)]
     scale = [s * f for s, f in zip(steps, factors, strict=True)]
     return names[::-1], ([*units, *[""] * rest])[::-1], ([*scale, *[1.0] * rest])[::-1], ([*shift, *[0.0] * rest])[::-1]
 

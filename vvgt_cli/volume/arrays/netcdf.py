@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import mmap
-import warnings
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -19,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.arrays.beside import Neighbour, choose_grid, with_neighbours
-from vvgt_cli.volume.labelled import DESCRIBES, axis, described_by, labelled_volume
+from vvgt_cli.volume.arrays.beside import Neighbour, choose_grid, warn_of_curvilinear, with_neighbours
+from vvgt_cli.volume.labelled import DESCRIBES, axis, described_by, flags_of, labelled_volume
 from vvgt_cli.volume.reading import ReadOptions, Volume, load_block, need, volume_name
 
 _TURN = Lock()  # the library is not for several threads
@@ -44,7 +43,10 @@ def read_netcdf(path: Path, options: ReadOptions) -> Volume:
             attributes["_FillValue"] = library.default_fillvals[kind]  # what the library fills unwritten values with
         source = f"{path}:{variable.name}"
         axes = [axis(name, size) for name, size in zip(variable.dimensions, variable.shape, strict=True)]
-        _warn_of_curvilinear(variable, attributes, source)
+        names, inside = str(attributes.get("coordinates", "")).split(), variable.group().variables
+        along = set(variable.dimensions)
+        warn_of_curvilinear([n for n in names if n in inside and len({*inside[n].dimensions} & along) > 1], source)
+        attributes |= flags_of(getattr(variable.datatype, "enum_dict", None))
         beside = _beside(variable)
         _refuse_mesh(beside, source)
         axes = with_neighbours(axes, beside, source, options.spacing is not None)
@@ -54,18 +56,6 @@ def read_netcdf(path: Path, options: ReadOptions) -> Volume:
         read = partial(_part, path, where) if by_box else lambda index: variable[index]
         chunks = _chunks(variable) if by_box else None
         return labelled_volume(read, np.dtype(variable.dtype), axes, attributes, options, source, name, chunks)
-
-
-def _warn_of_curvilinear(variable: Any, attributes: dict[str, Any], source: str) -> None:
-    """Warn where places are coordinates of two or more axes (CF, 5.2), which are not read."""
-    names = str(attributes.get("coordinates", "")).split()
-    group = variable.group()
-    odd = [n for n in names if n in group.variables and len(set(group[n].dimensions) & set(variable.dimensions)) > 1]
-    if odd:
-        warnings.warn(
-            f"{source}: its places are curvilinear ({', '.join(odd)}), which is not read: voxels lie on an even grid "
-            "of its axes (cdo remapbil or Resample in ParaView makes a regular one)", stacklevel=2,
-        )  # fmt: skip
 
 
 def _beside(variable: Any) -> dict[str, Neighbour]:

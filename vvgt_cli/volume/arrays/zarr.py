@@ -20,7 +20,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.arrays import MAX_CHUNK
-from vvgt_cli.volume.arrays.beside import Neighbour, choose_grid, with_neighbours
+from vvgt_cli.volume.arrays.beside import Neighbour, choose_grid, warn_of_curvilinear, with_neighbours
 from vvgt_cli.volume.labelled import Axis, axis, labelled_volume
 from vvgt_cli.volume.microscopy.image import hex_color
 from vvgt_cli.volume.reading import ReadOptions, Segment, Volume, need, segments_in
@@ -46,10 +46,12 @@ def read_zarr(path: Path, options: ReadOptions) -> Volume:
     array = _array(zarr, place)
     attributes = _marked(array)
     names = facts.get("dimension_names") or attributes.get("_ARRAY_DIMENSIONS") or [""] * array.ndim
-    axes = _ome_axes(place, array.shape) or [
+    axes = _ome_axes(place, array.shape, options.spacing is not None) or [
         axis(str(name or ""), size) for name, size in zip(names, array.shape, strict=True)
     ]
     beside = _beside(zarr, path, place, [a.name for a in axes if a.centres is None])
+    names = str(attributes.get("coordinates", "")).split()
+    warn_of_curvilinear([n for n in names if n in beside and not beside[n].size], str(place))
     axes = with_neighbours(axes, beside, str(place), options.spacing is not None)
     volume = labelled_volume(
         lambda index: np.asarray(array[index]), array.dtype, axes, attributes, options, str(place),
@@ -245,13 +247,14 @@ def _multiscale(group: Path) -> dict[str, Any]:
     return {}
 
 
-def _ome_axes(place: Path, shape: tuple[int, ...]) -> list[Axis]:
+def _ome_axes(place: Path, shape: tuple[int, ...], spacing_given: bool) -> list[Axis]:
     """Return the axes of a level of an OME-Zarr image; none where the array is not one.
 
     Images of versions before 0.3 state no axes: they are t, c, z, y, x.
 
     Raises:
         DataError: axes that do not fit the array.
+        UsageError: a transformation of another kind, and no spacing given.
     """
     image = _multiscale(place.parent)
     level = next((d for d in image.get("datasets", []) if str(d.get("path")) == place.name), None)
@@ -265,6 +268,12 @@ def _ome_axes(place: Path, shape: tuple[int, ...]) -> list[Axis]:
         )
     scale, shift = np.ones(len(shape)), np.zeros(len(shape))
     for step in [*level.get("coordinateTransformations", []), *image.get("coordinateTransformations", [])]:
+        kind = step.get("type", "identity")
+        if not spacing_given and kind != "identity" and (kind not in step or kind not in ("scale", "translation")):
+            raise UsageError(
+                f"{place}: OME-Zarr with a transformation {str(step)[:80]}; expected scale and translation as lists of "
+                "numbers: try --spacing X Y Z"
+            )
         factor = np.asarray(step.get("scale", np.ones(len(shape))), np.float64)
         scale, shift = scale * factor, shift * factor + np.asarray(step.get("translation", np.zeros(len(shape))))
     roles = {"time": "t", "channel": "c"}
@@ -273,9 +282,11 @@ def _ome_axes(place: Path, shape: tuple[int, ...]) -> list[Axis]:
         facts = entry if isinstance(entry, dict) else {"name": str(entry)}
         name = str(facts.get("name", "")).lower()
         role = roles.get(str(facts.get("type", "")), name if name in ("x", "y", "z", "t", "c") else "")
-        centres = shift[k] + scale[k] * np.arange(size) if role not in ("t", "c") else None
+        unit = str(facts.get("unit", "") or "")
+        placed = role not in ("t", "c") or (role == "t" and unit)
+        centres = shift[k] + scale[k] * np.arange(size) if placed else None
         labels, colors = _rendering(place.parent, size) if role == "c" else ((), ())
-        axes.append(Axis(name, size, centres, str(facts.get("unit", "") or ""), role, labels, colors))
+        axes.append(Axis(name, size, centres, unit, role, labels, colors, abs(float(scale[k]))))
     return axes
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ ANGLE = 1e-3  # of a unit normal: how far slices may be tilted against each othe
 EVEN = 0.01  # of the spacing: how far a slice may be off
 ROUNDED = 0.25  # of the spacing: how far it may be off by the rounding of its position; a missing slice is 0.5
 MOVIE = (0x00181063, 0x00181065)  # Frame Time and its vector: what frames that follow in time are counted by
+_REAL = "RealWorldValueMappingSequence"  # PS3.3, C.7.6.16.2.11
 _VECTORS = [key for key in ATTRIBUTES if key.endswith("Vector")]  # of frames of nuclear medicine
 CODECS = {  # what pydicom decodes a coding with, by words of its name, the first that fits
     "JPEG-LS": "pyjpegls",
@@ -53,6 +54,7 @@ class _Slice:
         tiles: along each edge of a mosaic; 1 for other images.
         facts: values of the attributes by which volumes of a series differ.
         instance: number of the image in its series, and of the frame in it.
+        real: unit of real-world values (PS3.3, C.7.6.16.2.11), "" if it is 1; None if values are others.
     """
 
     source: Source
@@ -66,6 +68,7 @@ class _Slice:
     placed: bool = True
     tiles: int = 1
     facts: dict[str, Any] = field(default_factory=dict)
+    real: str | None = None
 
     @property
     def instance(self) -> float:
@@ -106,7 +109,7 @@ def read_dicom(path: Path, options: ReadOptions) -> Volume:
         f"{path.resolve().name.removesuffix('.dcm').removesuffix('.zip')}{title}", slope, intercept,
         "LPS" if slices[0].placed else None, all(s.hounsfield for s in slices),
         None if reference is None else str(reference),
-        modality=printable(str(slices[0].header.get("Modality", "")))[:16], value_unit=unit,
+        modality=printable(str(slices[0].header.get("Modality", "")))[:16], value_unit=unit or slices[0].real or "",
     )  # fmt: skip
     return volume if heights is None else _resampled(volume, heights, options, path)
 
@@ -219,6 +222,7 @@ def _frame(source: Source, header: Any, groups: list[Any], k: int, options: Read
     slope, intercept, unit = (
         item("PixelValueTransformationSequence", f"Rescale{w}") for w in ("Slope", "Intercept", "Type")
     )
+    slope, intercept, unit, real = _real_world((*groups, header), slope, intercept, unit)
     scaling = (1.0 if slope is None else float(slope), 0.0 if intercept is None else float(intercept))
     if (dose := header.get("DoseGridScaling")) is not None:
         scaling = (float(dose), 0.0)
@@ -230,7 +234,26 @@ def _frame(source: Source, header: Any, groups: list[Any], k: int, options: Read
     facts = {key: _fact(item(sequence, keyword, key) if sequence else header.get(key), k if key in _VECTORS else None)
              for key, (_, sequence, keyword) in ATTRIBUTES.items()}  # fmt: skip
     return _Slice(source, k, header, place, rows, (float(between[1]), float(between[0])), scaling, hounsfield, placed,
-                  facts={key: value for key, value in facts.items() if value is not None})  # fmt: skip
+                  facts={key: value for key, value in facts.items() if value is not None}, real=real)  # fmt: skip
+
+
+def _real_world(groups: Sequence[Any], slope: Any, intercept: Any, unit: Any) -> tuple[Any, Any, Any, str | None]:
+    """Return slope, intercept and type of values, of a mapping to real-world values where none but 1, 0 are stated.
+
+    The fourth is `_Slice.real`. A warning says if another scale is stated.
+    """
+    mapping = next((group[_REAL][0] for group in groups if group.get(_REAL)), None)
+    if mapping is None or any(groups[-1].get(key) is not None for key in ("DoseGridScaling", "ModalityLUTSequence")):
+        return slope, intercept, unit, None
+    real = [mapping.get(f"RealWorldValue{w}") for w in ("Slope", "Intercept")]
+    stated = [1.0 if slope is None else float(slope), float(intercept or 0)]
+    if None in real or stated != [1.0, 0.0] or unit not in (None, "", "US"):  # unspecified
+        if stated != real:
+            warnings.warn("DICOM: its RealWorldValueMapping is not applied, but its rescale slope", stacklevel=4)
+        return slope, intercept, unit, None
+    codes = mapping.get("MeasurementUnitsCodeSequence") or [{}]
+    code = printable(str(codes[0].get("CodeValue", "")))[:40].replace("[hnsf'U]", HOUNSFIELD)
+    return *real, code or "?", "" if code == "1" else code
 
 
 def _fact(value: Any, k: int | None) -> Any:
@@ -387,6 +410,12 @@ def _decoded(one: _Slice) -> np.ndarray:
     from pydicom.pixels.processing import apply_modality_lut
 
     dataset = read_file(one.source)
+    stored, high = (one.header.get(key) for key in ("BitsStored", "HighBit"))
+    if None not in (stored, high) and high != stored - 1:
+        raise DataError(
+            f"{one.source}: HighBit {high} with BitsStored {stored}; expected {stored - 1} (DICOM, PS3.5, 8.1.1): try "
+            "gdcmconv --raw"
+        )
     try:
         values: np.ndarray = dataset.pixel_array
     except (NotImplementedError, RuntimeError) as error:  # a codec that pydicom does not have

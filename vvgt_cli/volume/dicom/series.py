@@ -44,6 +44,7 @@ TAGS: list[Any] = [  # all that is read of a header but its pixels: scanners' ho
     *("SpacingBetweenSlices", "RescaleSlope", "RescaleIntercept", "RescaleType", "DoseGridScaling", "SliceVector"),
     *("GridFrameOffsetVector", "ModalityLUTSequence", "PixelRepresentation", "SharedFunctionalGroupsSequence"),
     *("PerFrameFunctionalGroupsSequence", "DetectorInformationSequence", "FrameIncrementPointer", "SegmentSequence"),
+    *("RealWorldValueMappingSequence", "BitsStored", "HighBit"),
 ]
 
 

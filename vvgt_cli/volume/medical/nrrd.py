@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 import os
 import re
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -252,6 +253,9 @@ def _volume(path: Path, fields: HeaderFields, block: np.ndarray, sizes: list[int
     vectors = _vectors(fields, len(sizes))
     axis = _component_axis(fields, sizes, vectors)
     place = _place(fields, vectors, axis, sizes, options) | {"options": options, "name": volume_name(path)}
+    if "oldmin" in fields or "oldmax" in fields:
+        warnings.warn(f"{path}: old min and old max are not applied to its quantized values, as in ITK", stacklevel=2)
+    place["value_unit"] = _words(fields, "sampleunits")[0][:40] if fields.get("sampleunits") else ""
     if any(_SEGMENT.fullmatch(key) for key in fields):
         layer = options.component if isinstance(options.component, int) else None
         place["segments"] = segments_in(lambda: segments(fields, layer), str(path))

@@ -33,6 +33,11 @@ from vvgt_cli.volume.tiff.decode import Pages
 from vvgt_cli.volume.tiff.ome import ome_tag, open_tiff
 from vvgt_cli.volume.tiff.pages import check_pages
 
+_SIZES = {  # tags of programs that state voxel sizes in forms that are not read
+    33550: "ModelPixelScale", 34264: "ModelTransformation", 34412: "CZ_LSMINFO", 34118: "CZ_SEM", 34680: "FEI_SFEG",
+    34682: "FEI_TITAN", 51123: "MicroManagerMetadata",
+}  # fmt: skip
+_NODATA = 42113  # of GDAL
 _AXES = {"X": "columns", "Y": "rows", "Z": "slices", "T": "time steps", "C": "channels", "S": "samples"}
 
 
@@ -105,12 +110,29 @@ def read_tiff(path: Path, options: ReadOptions, slices: int = 1) -> Volume:
             facts.spacing, names=facts.channels, colors=facts.colors, rgb=layout.color, samples=bool(layout.of("S")),
             mapped=mapped is not None,
         )  # fmt: skip
+        _warn_of_unread(series.keyframe.tags, facts, options, path)
         if mapped is None:
             _whole(series, path)
         volume = picture_volume(picture, replace(options, stored=stored), str(path), volume_name(path))
     if doubts := facts.doubts(options, max(slices, len(volume.data)), str(path)):
         warnings.warn(f"{path}: {'; '.join(doubts)} (--spacing X Y Z sets it)", stacklevel=2)
-    return replace(volume, unit=facts.length)
+    if facts.scaling != (1.0, 0.0) and options.component == "magnitude":
+        raise UsageError(f"{path}: calibrated values, of which no magnitude is taken; choose one channel")
+    return replace(
+        volume, unit=facts.length, slope=facts.scaling[0], intercept=facts.scaling[1], value_unit=facts.value_unit
+    )
+
+
+def _warn_of_unread(tags: Any, facts: Facts, options: ReadOptions, path: Path) -> None:
+    """Warn of tags that state sizes, where no others do, or missing values, and are not read."""
+    if options.spacing is not None:
+        return
+    names = [name for code, name in _SIZES.items() if code in tags]
+    if names and facts.spacing == (None, None, None):
+        warnings.warn(f"{path}: sizes in {', '.join(names)} are not read; --spacing X Y Z sets them", stacklevel=3)
+    if _NODATA in tags:
+        value = str(tags[_NODATA].value).strip("\0 ")[:20]
+        warnings.warn(f"{path}: voxels of {value} (GDAL_NODATA) are read as values, not as missing", stacklevel=3)
 
 
 def _opened(path: Path, number: int) -> tuple[Any, Pages, Any]:
@@ -175,7 +197,8 @@ def _facts(file: Any, root: Any, series: Any, number: int, path: Path) -> Facts:
         first = file.pages.first
         x, y = (r if code in first.tags else None for code, r in zip((282, 283), first.get_resolution(), strict=True))
         description = imagej_facts(file.imagej_metadata or {}, (x, y), int(first.tags.valueof(296, default=1)))
-        facts = replace(description, channels=facts.channels)
+        scaling, value_unit = _calibration(file.imagej_metadata or {}, path)
+        facts = replace(description, channels=facts.channels, scaling=scaling, value_unit=value_unit)
         if facts.images > 1 and series.kind != "imagej" and root is None:
             short = first.dataoffsets[0] + facts.images * first.nbytes - path.stat().st_size if first.is_final else 0
             missing = f" ({size_text(short)} are missing)" if short > 0 else ""
@@ -259,6 +282,8 @@ class Facts:
         trouble: why the spacing cannot be used: units that do not compare, a size that is no number.
         assumed: what was assumed for the spacing.
         length: unit of the spacing, "um" or unknown.
+        scaling: slope and intercept of the values.
+        value_unit: unit of the values; "" unknown.
     """
 
     spacing: tuple[float | None, float | None, float | None] = (None, None, None)
@@ -268,6 +293,8 @@ class Facts:
     trouble: str = ""
     assumed: tuple[str, ...] = ()
     length: str = ""
+    scaling: tuple[float, float] = (1.0, 0.0)
+    value_unit: str = ""
 
     def doubts(self, options: ReadOptions, slices: int, source: str) -> list[str]:
         """Return what is assumed for the spacing; raise UsageError if it is unusable and none is given."""
@@ -353,6 +380,21 @@ def imagej_facts(stated: dict[str, Any], resolution: tuple[float | None, float |
     }
     facts = _micrometres(sizes, [name, str(stated.get("yunit", name)), str(stated.get("zunit", name))])
     return replace(facts, images=images, assumed=tuple(assumed))
+
+
+def _calibration(stated: dict[str, Any], path: Path) -> tuple[tuple[float, float], str]:
+    """Return slope, intercept and unit of values by ImageJ's calibration, a straight line (ij.measure.Calibration).
+
+    So it writes signed values, which it stores as unsigned. Any other function is not applied, and a warning says so.
+    """
+    if "cf" not in stated or stated["cf"] in (20, 21):  # none
+        return (1.0, 0.0), ""
+    unit = str(stated.get("vunit", ""))[:40]
+    offset, slope = (n if isinstance(n := stated.get(key), int | float) else math.nan for key in ("c0", "c1"))
+    if stated["cf"] != 0 or not slope or not math.isfinite(slope + offset) or "c2" in stated:
+        warnings.warn(f"{path}: values are not calibrated as ImageJ's function {stated['cf']} says", stacklevel=4)
+        return (1.0, 0.0), ""
+    return (float(slope), float(offset)), "" if unit == "Gray Value" else unit
 
 
 def count_planes(file: Any) -> None:

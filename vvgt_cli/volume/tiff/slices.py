@@ -11,6 +11,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -70,10 +71,18 @@ def read_slices(files: list[Path], options: ReadOptions, source: str, name: str)
             raise DataError(f"{text} (of an OME set give one of the files alone)")
         return volume
 
+    def alike(path: Path) -> np.ndarray:
+        volume = page(path)
+        if (volume.slope, volume.intercept) != (first.slope, first.intercept):
+            raise DataError(f"{path}: calibrated values of another scale than those of {files[0].name}; expected one")
+        return volume.data
+
     read: Callable[[Path], np.ndarray]
+    values: dict[str, Any] = {}
     if files[0].suffix.lower() in TIFF:
         first = page(files[0], max(len(files), 2))
-        plane, spacing, unit, read = first.data, first.spacing, first.unit, lambda path: page(path).data
+        plane, spacing, unit, read = first.data, first.spacing, first.unit, alike
+        values = {"slope": first.slope, "intercept": first.intercept, "value_unit": first.value_unit}
     else:
         read = picture_planes(files, options, source)
         plane, spacing, unit = read(files[0]), options.spacing_or((1.0, 1.0, 1.0)), ""
@@ -83,7 +92,7 @@ def read_slices(files: list[Path], options: ReadOptions, source: str, name: str)
     shape = (len(files), *plane.shape[1:])
     part = partial(_part, files, plane, read)
     field = stored_or_loaded(part, plane.dtype, shape, (1, *plane.shape[1:]), source, options.stored)
-    return Volume(field, spacing, name=name, unit=unit)
+    return Volume(field, spacing, name=name, unit=unit, **values)
 
 
 def _part(files: list[Path], plane: np.ndarray, load: Callable[[Path], np.ndarray], slices: Slices) -> np.ndarray:
