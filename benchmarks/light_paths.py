@@ -4,8 +4,8 @@
 
 `grid_db`: dB over RGB of the ray-cast view (test view 3, 3 x 3 rays a pixel) against the picture of paths; `noise_db`:
 of the latter, from its halves; `light_seconds`: processor time of the grid. Repeat `--paths` for a curve.
-With `--gaussians K`, `ply_db` of a conversion for a screen of this size, and `ply_grid_db` beside the view, too; all are
-then without the noise of the paths: the mean of the product of the differences from the two halves.
+With `--gaussians K`, `ply_db` of a conversion for a screen of this size, and `ply_grid_db` beside the view, too; all
+are then without the noise of the paths: the mean of the product of the differences from the two halves.
 With `--pictures DIR` no rows, but a JPEG a scene: unlit, under a headlight, and under the first sky.
 """
 

@@ -246,7 +246,9 @@ def _transform(array: N5Array, n: int) -> tuple[list[str], list[str], list[float
     spatial = min(n, 3)
     steps = _floats(size, spatial) or [1.0] * spatial
     level = int(array.place.name[1:]) if re.fullmatch(r"s\d{1,3}", array.place.name) else 0
-    levels = next((above[k] for k in ("scales", "downsamplingFactors") if isinstance(above.get(k), list)), [])
+    levels: list[Any] = next(
+        (above[k] for k in ("scales", "downsamplingFactors") if isinstance(above.get(k), list)), []
+    )
     listed = levels[level] if level < len(levels) else None  # of all levels, by the group
     factors = _floats(facts.get("downsamplingFactors", listed), spatial) or [1.0] * spatial
     first = _floats(facts.get("offset"), spatial) or [0.0] * spatial
