@@ -93,11 +93,13 @@ export function panel(look, viewer, live) {
   list.addEventListener('change', () => choose(list.selectedIndex));
 
   // the look, MIP or X-ray: of one layer of values
-  const kinds = find('.kind'), values = layers.length === 1 && layers[0].nodes;
+  const kinds = find('.kind'), values = layers.length === 1 ? layers[0].nodes : undefined;
   let drawn = 0;
   const grey = values && greys(look, live.layers[0], history), kept = values && piece(look, history);
-  if (values) root.append(grey.root, kept.root);
-  grey?.draw(0);
+  if (values) {
+    root.append(grey.root, kept.root);
+    grey.draw(0);
+  }
   function draw(k) {
     drawn = kinds.selectedIndex = k;
     look.draw(k);
