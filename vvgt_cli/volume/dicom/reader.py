@@ -55,7 +55,7 @@ class _Slice:
         facts: values of the attributes by which volumes of a series differ.
         instance: number of the image in its series, and of the frame in it.
         real: slope, intercept (NaN in a table) and unit of each mapping to real-world values.
-        stated: the header states a scale or a unit besides.
+        scaled: the header states a scale or a unit besides.
     """
 
     source: Source
@@ -70,7 +70,7 @@ class _Slice:
     tiles: int = 1
     facts: dict[str, Any] = field(default_factory=dict)
     real: frozenset[tuple[float, float, str]] = frozenset()
-    stated: bool = False
+    scaled: bool = False
 
     @property
     def instance(self) -> float:
@@ -235,13 +235,13 @@ def _frame(source: Source, header: Any, groups: list[Any], k: int, options: Read
         scaling, intercept, unit = (1.0, 0.0), 0.0, table.get("ModalityLUTType")
     hounsfield = header.get("Modality") == "CT" and intercept is not None and (unit or HOUNSFIELD) == HOUNSFIELD
     activity = header.get("Modality") == "PT" and bool(header.get("Units"))
-    stated = activity or scaling != (1, 0) or unit not in (None, "", "US")  # unspecified
+    scaled = activity or scaling != (1, 0) or unit not in (None, "", "US")  # unspecified
     real = _mappings((*groups, header)) if dose is None and table is None else frozenset()
     facts = {key: _fact(item(sequence, keyword, key) if sequence else header.get(key), k if key in _VECTORS else None)
              for key, (_, sequence, keyword) in ATTRIBUTES.items()}  # fmt: skip
     facts = {key: value for key, value in facts.items() if value is not None}
     return _Slice(source, k, header, place, rows, (float(between[1]), float(between[0])), scaling, hounsfield, placed,
-                  facts=facts, real=real, stated=stated)  # fmt: skip
+                  facts=facts, real=real, scaled=scaled)  # fmt: skip
 
 
 def _mappings(groups: Sequence[Any]) -> frozenset[tuple[float, float, str]]:
@@ -262,7 +262,7 @@ def _in_real_world(slices: list[_Slice], path: Path) -> tuple[list[_Slice], str 
     Otherwise, as where another scale is stated or a slice has several mappings, slices stay as they are, and the unit
     is None; a warning says so unless the scales are the same.
     """
-    mappings = [next(iter(s.real)) for s in slices if len(s.real) == 1 and not s.stated]
+    mappings = [next(iter(s.real)) for s in slices if len(s.real) == 1 and not s.scaled]
     numbers = [mapping[:2] for mapping in mappings]
     units = {unit for _, _, unit in mappings}
     if len(mappings) == len(slices) and len(units) == 1 and np.isfinite(numbers).all():
