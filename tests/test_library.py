@@ -284,3 +284,6 @@ def test_a_dataset_of_xarray_and_curvilinear_places(field):
         assert np.array_equal(vvgt.read_volume(dataset, array="b").data, -field)
     with pytest.raises(vvgt.UsageError, match=r"several variables: a .*; b"):
         vvgt.read_volume(dataset)
+    dates = (("z", "y", "x"), np.zeros(field.shape, "M8[ns]"))
+    with pytest.warns(UserWarning, match="curvilinear"):
+        assert np.array_equal(vvgt.read_volume(dataset.drop_vars("b").assign(dates=dates)).data, field)

@@ -174,3 +174,37 @@ def test_flags_and_enumerations_are_labels(tmp_path: Path, form: str) -> None:
         with netCDF4.Dataset(path, "a") as file:
             file["kind"].flag_masks = np.arange(3, dtype="u1")
         assert read_volume(str(path)).segments is None
+
+
+@pytest.mark.parametrize(
+    "stated",
+    [
+        {"scale_factor": 0.01}, {"units": "percent"}, {"valid_range": np.array([0, 100], "u1")}, {"dtype": "f4"},
+        {"flag_meanings": "land"},
+    ],
+)  # fmt: skip
+def test_flags_of_a_quantity_and_damaged_ones_make_no_labels(tmp_path: Path, stated: dict) -> None:
+    stated = {"dtype": "u1", "flag_values": np.array([251, 253], "u1"), "flag_meanings": "land coast", **stated}
+    with netCDF4.Dataset(tmp_path / "v.nc", "w") as file:
+        for name, size in zip("zyx", (3, 4, 5), strict=True):
+            file.createDimension(name, size)
+        for name in ("whole", "holed"):
+            one = file.createVariable(name, stated["dtype"], ("z", "y", "x"), fill_value=255)
+            one[:] = np.where((np.arange(60) == 0) & (name == "holed"), 255, np.arange(60)).reshape(3, 4, 5)
+            one.setncatts({key: value for key, value in stated.items() if key != "dtype"})
+    for name in ("whole", "holed"):
+        for stored in (False, True):
+            assert read_volume(str(tmp_path / "v.nc"), ReadOptions(array=name, stored=stored)).segments is None
+
+
+def test_flags_have_the_sign_of_their_values(tmp_path: Path) -> None:
+    flags = np.array([0, 251], "u1").view("i1")
+    with netCDF4.Dataset(tmp_path / "v.nc", "w") as file:
+        for name, size in zip("zyx", (3, 4, 5), strict=True):
+            file.createDimension(name, size)
+        file.createVariable("kind", "i1", ("z", "y", "x"))[:] = flags[np.arange(60).reshape(3, 4, 5) % 2]
+        told = {"_Unsigned": "true", "valid_max": flags[1], "flag_values": flags, "flag_meanings": "sea land"}
+        file["kind"].setncatts(told)
+    for stored in (False, True):
+        volume = read_volume(str(tmp_path / "v.nc"), ReadOptions(stored=stored))
+        assert [one.number for one in volume.segments or ()] == np.unique(volume.data[:]).tolist() == [0, 251]

@@ -117,16 +117,22 @@ def test_pressure_points_down_and_other_directions_are_said(tmp_path: Path) -> N
         read_volume(write_netcdf(tmp_path / "u.nc", "depth", STEPS, units="m"))
 
 
-def test_curvilinear_places_are_said(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("names", "placed"), [("lon lat", "z"), ("lon lat", "zji"), ("valid_time", "z")])
+def test_curvilinear_places_are_said(tmp_path: Path, names: str, placed: str) -> None:
     with netCDF4.Dataset(tmp_path / "v.nc", "w") as file:
         for name, n in (("z", 4), ("j", 5), ("i", 6)):
             file.createDimension(name, n)
-        for name in ("lon", "lat"):
+        for name in placed:  # j and i of a projection
+            file.createVariable(name, "f8", (name,))[:] = np.arange(file.dimensions[name].size)
+        for name in names.split():
             file.createVariable(name, "f4", ("j", "i"))[:] = 0
         file.createVariable("t", "f4", ("z", "j", "i"))[:] = COUNT
-        file["t"].coordinates = "lon lat"
-    with pytest.warns(UserWarning, match=r"curvilinear \(lon, lat\), which is not read.*cdo remapbil"):
+        file["t"].coordinates = names
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
         read_volume(str(tmp_path / "v.nc"))
+    found = [re.search(r"curvilinear \((.*)\), which is not read.*cdo remapbil", str(one.message)) for one in told]
+    assert [one[1] for one in found if one] == (["lon, lat"] if (names, placed) == ("lon lat", "z") else [])
 
 
 @pytest.mark.parametrize("suffix", [".nc", ".h5"])

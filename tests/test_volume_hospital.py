@@ -432,9 +432,21 @@ def test_real_world_values_where_no_other_scale_is_stated(tmp_path: Path, rescal
 
 def test_real_world_values_beside_another_scale_are_said(tmp_path: Path) -> None:
     told = {"RealWorldValueMappingSequence": [real_world(0.5, 3.0, "mm2/s")], "RescaleSlope": 2, "RescaleIntercept": 1}
-    with pytest.warns(UserWarning, match="its RealWorldValueMapping is not applied, but its rescale slope"):
+    with pytest.warns(UserWarning, match="its RealWorldValueMapping is not applied"):
         volume = read_volume(series(tmp_path, [{}], **told))
     assert (volume.slope, volume.intercept, volume.value_unit) == (2, 1, "")
+
+
+@pytest.mark.parametrize(("slopes", "scales"), [((2, 1, 4, 2), (0.5,)), ((1, 1, 1, 1), (0.5, 3.0))])
+def test_real_world_values_are_of_all_slices_or_none(tmp_path: Path, slopes: tuple, scales: tuple) -> None:
+    mappings = [real_world(scale, 3.0, "mm2/s") for scale in scales]
+    for k, (plane, slope) in enumerate(zip(STACK, slopes, strict=True)):
+        told = {"RealWorldValueMappingSequence": mappings, "RescaleSlope": slope, "RescaleIntercept": 0}
+        save(image(plane, (0, 0, 2 * k), InstanceNumber=k + 1, **told), tmp_path / f"{k}.dcm")
+    with pytest.warns(UserWarning, match="its RealWorldValueMapping is not applied") as said:
+        volume = read_volume(str(tmp_path))
+    np.testing.assert_array_equal(volume.data * volume.slope + volume.intercept, STACK * np.reshape(slopes, (4, 1, 1)))
+    assert (volume.value_unit, len(said)) == ("", 1)
 
 
 def test_parametric_maps_as_in_highdicom(tmp_path: Path) -> None:

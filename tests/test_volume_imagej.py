@@ -180,7 +180,26 @@ def test_calibrated_values(tmp_path: Path, sliced: bool) -> None:
         refused(DataError, r"v2\.tif: calibrated values of another scale than those of v0", read_volume, str(tmp_path))
 
 
-def test_other_calibrations_are_said(tmp_path: Path) -> None:
-    tifffile.imwrite(tmp_path / "v.tif", VALUES[0, 0], imagej=True, metadata={**SIGNED, "cf": 1, "c2": 3.0})
-    with pytest.warns(UserWarning, match="not calibrated as ImageJ's function 1 says"):
-        np.testing.assert_array_equal(read_volume(str(tmp_path / "v.tif")).data, VALUES[0, 0])
+@pytest.mark.parametrize(("function", "said"), [(1, 1), (20, 0), (21, 1)])
+def test_other_calibrations_are_said_once(tmp_path: Path, function: int, said: int) -> None:
+    for k, plane in enumerate(VALUES[0, 0]):
+        facts = {**SIGNED, "axes": "YX", "cf": function, "c2": 3.0}
+        tifffile.imwrite(tmp_path / f"v{k}.tif", plane, imagej=True, metadata=facts)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        np.testing.assert_array_equal(read_volume(str(tmp_path)).data, VALUES[0, 0])
+    assert sum(f"not calibrated as ImageJ's function {function} says" in str(one.message) for one in told) == said
+
+
+@pytest.mark.parametrize("kind", ["float32", "int16", "colours"])
+def test_calibrations_are_of_unsigned_values(tmp_path: Path, kind: str) -> None:
+    """ImageJ adds 32768 to signed values as it reads them, and calibrates neither floats nor colours."""
+    text = "images=1\ncf=0\nc0=-32668.0\nc1=1.0\nvunit=HU\n"
+    values = VALUES[0, 0, :3].astype("u1" if kind == "colours" else kind)
+    values, how = (values.transpose(1, 2, 0), "rgb") if kind == "colours" else (values[0], "minisblack")
+    path = tmp_path / "v.tif"
+    tifffile.imwrite(path, values, photometric=how, metadata=None, description=f"ImageJ=1.53c\n{text}")
+    volume = read_volume(str(path), ReadOptions(component=0) if kind == "colours" else ReadOptions())
+    expected = values[..., 0] if kind == "colours" else values + (100 if kind == "int16" else 0)
+    np.testing.assert_array_equal(volume.data[0] * volume.slope + volume.intercept, expected)
+    assert volume.value_unit == ("" if kind == "colours" else "HU")

@@ -215,6 +215,8 @@ def test_n5_levels_and_what_is_refused(vvgt, store: Path, tmp_path: Path) -> Non
         (tmp_path / "p.n5" / "attributes.json").write_text(json.dumps({key: [[1, 1, 1], [2, 2, 1]]}))
         coarse = read_volume(str(tmp_path / "p.n5"), ReadOptions(level=1))
         assert (coarse.spacing, coarse.origin) == ((1.0, 2.0, 2.0), (10.25, 20.5, 30.0))
+    facts.write_text(json.dumps(told | {"pixelResolution": {"unit": "um", "dimensions": [1, 2, 2]}}))  # its own
+    assert read_volume(str(tmp_path / "p.n5"), ReadOptions(level=1)).spacing == (1.0, 2.0, 2.0)
     block = store / "raw" / "0" / "0" / "0"
     block.write_bytes(block.read_bytes()[:-4])
     refused(DataError, r"its .4, 4, 4. values need 256", read_volume, f"{store}:/raw")

@@ -1,5 +1,6 @@
 """PET in SUV by body weight: the formula of QIBA's pseudo-code by hand, in float64, and headers that lack something."""
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 from pydicom.dataset import Dataset
 
 from tests.refused import refused
-from tests.test_volume_hospital import image, save
+from tests.test_volume_hospital import image, real_world, save
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume import ReadOptions, read_volume
 
@@ -81,6 +82,23 @@ def test_slices_of_several_slopes(tmp_path: Path) -> None:
     slopes = (0.5, 1.0, 2.0)
     volume = read_volume(pet(tmp_path, slopes))
     np.testing.assert_allclose(values(volume), STORED * np.reshape(slopes, (3, 1, 1)) * BY_WEIGHT, rtol=1e-6)
+
+
+def test_real_world_values_are_never_multiplied_again(tmp_path: Path) -> None:
+    mapped = {"RealWorldValueMappingSequence": [real_world(2.0, 0.0, "g/ml{SUVbw}")]}
+    source = pet(tmp_path / "activity", (1.0,) * 3, **mapped)
+    for suv, unit, factor in ((None, "SUVbw", BY_WEIGHT), ("none", "Bq/ml", 1.0)):
+        with pytest.warns(UserWarning, match="its RealWorldValueMapping is not applied"):
+            volume = read_volume(source, ReadOptions(suv=suv))
+        assert volume.value_unit == unit
+        np.testing.assert_allclose(values(volume), STORED * factor, rtol=1e-12)
+    source = pet(tmp_path / "none", (1.0,) * 3, Units=None, **mapped)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        volume = read_volume(source)
+    assert volume.value_unit == "g/ml{SUVbw}"
+    np.testing.assert_array_equal(values(volume), 2.0 * STORED)
+    refused(DataError, "leave out --suv bw", read_volume, source, ReadOptions(suv="bw"))
 
 
 @pytest.mark.parametrize(

@@ -347,11 +347,15 @@ def test_info_and_a_series_of_one_file(vvgt, tmp_path: Path) -> None:
     assert json.loads(vvgt("info", source, "--channel", "1", "--json").out)["time_steps"] == 3
 
 
-def test_sizes_and_missing_values_in_other_tags_are_said(tmp_path: Path) -> None:
-    tags = [(42113, "s", 0, "-9999", True), (33550, "d", 3, (30.0, 30.0, 0.0), True)]
+@pytest.mark.parametrize("spacing", [None, (1, 2, 3)])
+@pytest.mark.parametrize("missing", ["-9999", "nan"])
+def test_sizes_and_missing_values_in_other_tags_are_said(tmp_path: Path, missing: str, spacing: tuple | None) -> None:
+    tags = [(42113, "s", 0, missing, True), (33550, "d", 3, (30.0, 30.0, 0.0), True)]
     tifffile.imwrite(tmp_path / "v.tif", np.ones((3, 4, 5), "f4"), photometric="minisblack", extratags=tags)
-    with (
-        pytest.warns(UserWarning, match=r"sizes in ModelPixelScale are not read; --spacing X Y Z sets them"),
-        pytest.warns(UserWarning, match=r"voxels of -9999 \(GDAL_NODATA\) are read as values, not as missing"),
-    ):
-        read_volume(str(tmp_path / "v.tif"))
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        read_volume(str(tmp_path / "v.tif"), ReadOptions(spacing=spacing))
+    text = " ".join(str(one.message) for one in told)
+    assert ("sizes in ModelPixelScale are not read; --spacing X Y Z sets them" in text) == (spacing is None)
+    assert ("voxels of -9999 (GDAL_NODATA) are read as values, not as missing" in text) == (missing == "-9999")
+    assert len(told) == (spacing is None) + (missing == "-9999")

@@ -29,7 +29,7 @@ from vvgt_cli.volume import ReadOptions, Volume
 from vvgt_cli.volume.arrays.beside import Neighbour, choose_grid, warn_of_curvilinear, with_neighbours
 from vvgt_cli.volume.components import contiguous
 from vvgt_cli.volume.dask_arrays import Chunks, is_dask, lazy
-from vvgt_cli.volume.labelled import axis, labelled_volume
+from vvgt_cli.volume.labelled import axis, described_by, labelled_volume
 from vvgt_cli.volume.space import SPACES, unit_rows
 from vvgt_cli.volume.stored import Stored
 
@@ -399,17 +399,22 @@ def _refuse(given: Sequence[str], why: str) -> None:
 def _labelled(data: Any, options: ReadOptions, name: str) -> Volume:
     """Read an xarray.DataArray; one of Dask block by block, or as a whole for a magnitude or another grid."""
     if hasattr(data, "data_vars"):  # a Dataset
-        grids = {str(key): (one.shape, one.dtype.name) for key, one in data.data_vars.items()}
+        described = {name for one in data.variables.values() for name in described_by(one.attrs)}
+        grids = {
+            str(key): (one.shape, one.dtype.name)
+            for key, one in data.data_vars.items()
+            if key == options.array or (one.dtype.kind in "iufb" and key not in described)
+        }
         data = data[choose_grid(grids, options.array, name, "variable")]
     axes = [axis(str(dim), size) for dim, size in zip(data.dims, data.shape, strict=True)]
     label = str(data.name or name)
-    warn_of_curvilinear([str(key) for key, one in data.coords.items() if one.ndim > 1], label)
     beside = {
         str(key): Neighbour.of(one.shape, lambda one=one: (one.values, one.attrs), str(one.dims[0]))
         for key, one in data.coords.items()
         if one.ndim == 1
     }
     axes = with_neighbours(axes, beside, label, options.spacing is not None)
+    warn_of_curvilinear([str(key) for key, one in data.coords.items() if one.ndim > 1], axes, label)
     if data.chunks is None:
         return labelled_volume(lambda index: data[index].values, data.dtype, axes, data.attrs, options, label, label)
     read = Chunks(data.data, label)

@@ -32,7 +32,8 @@ from vvgt_cli.volume.space import metres, unit_name
 
 EVEN = 0.01  # of a step that a coordinate may be off and still count as evenly spaced (float32 longitudes are)
 AXIS_ATTRIBUTES = ("axis", "standard_name", "units", "positive", "_CoordinateZisPositive")
-MARKS = ("_FillValue", "missing_value", "valid_min", "valid_max", "valid_range")
+LIMITS = ("valid_min", "valid_max", "valid_range")
+MARKS = ("_FillValue", "missing_value", *LIMITS)
 NAMING = ("long_name", "standard_name", "units", "flag_values", "flag_meanings", "flag_masks")  # of the values
 CF_ATTRIBUTES = (
     *("scale_factor", "add_offset", "_FillValue", "missing_value"),
@@ -49,6 +50,7 @@ _ROLES = {
     "z": {"z", "lev", "level", "plev", "depth", "height", "altitude", "elevation", "pressure", "air_pressure"},
     "t": {"t", "time"},
 }
+_NO_LENGTHS = ("", "1", "degrees", "rad", "level", "pixel", "px", "voxel")  # units by which no length is meant
 _PRESSURES = {
     *("pa", "hpa", "kpa", "dbar", "bar", "mbar", "pascal", "pascals", "millibar", "millibars", "decibar", "decibars"),
     *("atm", "atmosphere"),
@@ -112,15 +114,13 @@ def axis(name: str, size: int, centres: np.ndarray | None = None, attributes: Ma
     return Axis(name, size, centres, units, role)
 
 
-def even_axis(
-    name: str, size: int, first: float, step: float, attributes: Mapping[str, Any] | None = None, role: str = ""
-) -> Axis:
+def even_axis(name: str, size: int, first: float, step: float, attributes: Mapping[str, Any] | None = None) -> Axis:
     """Make an axis of evenly spaced values, whose step is known even if there is only one value; else as `axis`."""
     line = axis(name, max(size, 2), first + step * np.arange(max(size, 2)), attributes)
     if line.centres is None:
         return line
     one_step = float(abs(line.centres[1] - line.centres[0]))
-    return replace(line, size=size, centres=line.centres[:size], role=role or line.role, step=one_step)
+    return replace(line, size=size, centres=line.centres[:size], step=one_step)
 
 
 def _points_down(stated: Mapping[str, str], words: Sequence[str], centres: np.ndarray) -> bool:
@@ -200,7 +200,7 @@ def labelled_volume(
     if field.ndim == 2:
         field, spatial = field[None], [Axis("", 1), *spatial]
     volume = _placed(field, spatial, (slope, intercept), options, source, name)
-    return _named(volume, attributes, _time(axes, options), source)
+    return _named(volume, attributes, dtype, _time(axes, options), source)
 
 
 def _warn_of_unread(axes: Sequence[Axis], attributes: Mapping[str, Any], options: ReadOptions, source: str) -> None:
@@ -279,8 +279,7 @@ def decode(values: np.ndarray, attributes: Mapping[str, Any], source: str) -> tu
     Returns:
         values, slope, intercept: the data value is ``slope * values + intercept``.
     """
-    slope = _number(attributes, "scale_factor", 1.0, source)
-    intercept = _number(attributes, "add_offset", 0.0, source)
+    slope, intercept = _scaling(attributes, source)
     values = values.view(stored_type(values.dtype, attributes))
     missing = _missing(values, attributes, slope, intercept)
     if missing is None or not missing.any():
@@ -299,6 +298,10 @@ def stored_type(dtype: np.dtype, attributes: Mapping[str, Any]) -> np.dtype:
     """Return the type of stored values, for integers with the sign that ``_Unsigned`` states (NUG, appendix B)."""
     signs = {"true": "iu", "false": "ui"}.get(text_of(attributes.get("_Unsigned", "")).lower(), "  ")
     return np.dtype(dtype.str.replace(*signs)) if dtype.kind in "iu" else dtype
+
+
+def _scaling(attributes: Mapping[str, Any], source: str) -> tuple[float, float]:
+    return _number(attributes, "scale_factor", 1.0, source), _number(attributes, "add_offset", 0.0, source)
 
 
 def _number(attributes: Mapping[str, Any], key: str, default: float, source: str) -> float:
@@ -321,7 +324,7 @@ def _missing(values: np.ndarray, attributes: Mapping[str, Any], slope: float, in
     limits = _marks(attributes, "valid_range", values.dtype)
     lo = _marks(attributes, "valid_min", values.dtype) or limits[:1]
     hi = _marks(attributes, "valid_max", values.dtype) or limits[1:2]
-    if any(_unpacked(attributes, key, values.dtype) for key in ("valid_range", "valid_min", "valid_max")):
+    if any(_unpacked(attributes, key, values.dtype) for key in LIMITS):
         lo, hi = ([_packed(m, slope, intercept) for m in some] for some in ((lo, hi) if slope > 0 else (hi, lo)))
     tests += [values < lo[0]] if lo else []
     tests += [values > hi[0]] if hi else []
@@ -364,21 +367,32 @@ def _time(axes: Sequence[Axis], options: ReadOptions) -> tuple[float, str] | Non
     return next(((float(a.centres[options.time or 0]), a.units) for a in stated if a.centres is not None), None)
 
 
-def _named(volume: Volume, attributes: Mapping[str, Any], time: tuple[float, str] | None, source: str) -> Volume:
-    """Return the volume with its time, and name, unit and labels that attributes give its values, as CF has them."""
+def _named(
+    volume: Volume, attributes: Mapping[str, Any], dtype: np.dtype, time: tuple[float, str] | None, source: str
+) -> Volume:
+    """Return the volume with its time, and name, unit and labels that attributes give its values, as CF has them.
+
+    Flags are labels if values are stored as integers (``dtype``) and no unit, no scale and no bits are stated.
+    """
     long, standard, unit = (printable(text_of(attributes.get(key, ""))).strip()[:40] for key in NAMING[:3])
-    bare = unit in ("1", "none", "unitless", "dimensionless")
-    flags = {"flag_values", "flag_meanings"} <= attributes.keys() and "flag_masks" not in attributes  # bits
-    flags = flags and (volume.slope, volume.intercept) == (1, 0)
-    segments = segments_in(lambda: _flags(attributes), source) if flags else None
-    return replace(volume, quantity=long or standard, value_unit="" if bare else unit, time=time, segments=segments)
+    unit = "" if unit in ("1", "none", "unitless", "dimensionless") else unit
+    segments = None
+    flags = {"flag_values", "flag_meanings"} <= attributes.keys() and "flag_masks" not in attributes
+    if flags and dtype.kind in "iu" and not unit and _scaling(attributes, source) == (1, 0):
+        segments = segments_in(lambda: _flags(attributes, stored_type(dtype, attributes)), source) or None
+    return replace(volume, quantity=long or standard, value_unit=unit, time=time, segments=segments)
 
 
-def _flags(attributes: Mapping[str, Any]) -> list[Segment]:
-    """Return the labels of CF's flags (3.5), words with _ for blanks, or of an enumeration, which are a list."""
-    words, numbers = attributes["flag_meanings"], np.ravel(attributes["flag_values"])
+def _flags(attributes: Mapping[str, Any], dtype: np.dtype) -> list[Segment]:
+    """Return the labels of CF's flags (3.5), words with _ for blanks, or of an enumeration, which are a list.
+
+    There are none if limits of the values lie beyond the flags, which then mark special values of a quantity.
+    """
+    words, numbers = attributes["flag_meanings"], _marks(attributes, "flag_values", dtype)
     names = words if isinstance(words, list) else [word.replace("_", " ") for word in text_of(words).split()]
-    return [Segment(int(number), name) for number, name in zip(numbers, names, strict=True)]
+    segments = [Segment(int(number), name) for number, name in zip(numbers, names, strict=True)]
+    limits = [limit for key in LIMITS for limit in _marks(attributes, key, dtype)]
+    return segments if all(min(numbers) <= limit <= max(numbers) for limit in limits) else []
 
 
 def flags_of(names: Mapping[str, int] | None) -> dict[str, Any]:
@@ -405,7 +419,7 @@ def _placed(
             raise
         axes, unit = [replace(a, centres=None, step=0.0) for a in axes], ""
     centres = [a.centres for a in axes]
-    if options.spacing is None and last not in ("", "1", "degrees", "level") and metres(last) is None:
+    if options.spacing is None and last not in _NO_LENGTHS and metres(last) is None:
         warnings.warn(f"{source}: unit {last!r} is not a known unit of length; numbers are kept", stacklevel=4)
     bare = [a.name or "unnamed" for a, c in zip(axes, centres, strict=True) if c is None and a.size > 1]
     if options.spacing is None and bare and any(c is not None and c.size > 1 for c in centres):
@@ -450,7 +464,7 @@ def _left(
     kind = stored_type(dtype, attributes)
     wide = marked and kind.kind != "f"
     final = float_dtype(kind) if wide else kind
-    scale = _number(attributes, "scale_factor", 1.0, source), _number(attributes, "add_offset", 0.0, source)
+    scale = _scaling(attributes, source)
     inner = [sorted(zyx).index(k) for k in zyx]
 
     def read(slices: tuple[slice, ...]) -> np.ndarray:
@@ -466,7 +480,7 @@ def _left(
 
     field: Any = Stored(read, final, tuple(axes[k].size for k in zyx), [chunks[k] for k in zyx], source)
     volume = _placed(field, [axes[k] for k in zyx], (1.0, 0.0) if wide else scale, options, source, name)
-    return _named(volume, attributes, _time(axes, options), source)
+    return _named(volume, attributes, dtype, _time(axes, options), source)
 
 
 def _descends(a: Axis, source: str) -> bool:

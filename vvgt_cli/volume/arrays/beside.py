@@ -21,6 +21,7 @@ _LETTER = re.compile(r"(?:(?:coord(?:inate)?s?|grid|axis)_?)?([xyzt])[ _([]*(\w*
 _SUFFIXES = re.compile(r"|s|c|v|ax(?:is|es)|grid|(?:coord(?:inate)?|cent(?:er|re)|value|val|pos(?:ition)?)s?", re.I)
 _NUMBERED = re.compile(r"(?:dim|axis|coord)_?(\d)", re.I)
 _GEOMETRY = {re.sub("_", "", word.lower()) for word in GEOMETRY}
+_PLACE = re.compile("lon|lat|^[xy]c?$", re.I)  # of two axes
 _PLACES = re.compile(r"(?:particles?_?)?(?:coord(?:inate)?s?|pos(?:ition)?s?|xyz)", re.I)
 _VECTORS = re.compile(r"(?:particles?_?)?(?:vel(?:ocity|ocities)?|accelerations?|forces?|moment(?:um|a))", re.I)
 
@@ -89,12 +90,16 @@ def with_neighbours(
     return axes
 
 
-def warn_of_curvilinear(odd: Sequence[str], source: str) -> None:
-    """Warn where places are coordinates of two or more axes (CF, 5.2), named by ``odd``, which are not read."""
-    if odd:
+def warn_of_curvilinear(odd: Sequence[str], axes: Sequence[Axis], source: str) -> None:
+    """Warn where places are coordinates of two or more axes (CF, 5.2), which are not read, and axes have no others.
+
+    ``odd`` names all such coordinates.
+    """
+    places = [name for name in odd if _PLACE.search(name)]
+    if places and sum(a.centres is not None and a.role not in ("z", "t", "c") for a in axes) < 2:
         warnings.warn(
-            f"{source}: its places are curvilinear ({', '.join(odd)}), which is not read: voxels lie on an even grid "
-            "of its axes (cdo remapbil or Resample in ParaView makes a regular one)", stacklevel=3,
+            f"{source}: its places are curvilinear ({', '.join(places)}), which is not read: voxels lie on an even "
+            "grid of its axes (cdo remapbil or Resample in ParaView makes a regular one)", stacklevel=3,
         )  # fmt: skip
 
 

@@ -237,8 +237,11 @@ def _transform(array: N5Array, n: int) -> tuple[list[str], list[str], list[float
         units = [str(u) for u in _list(stated.get("units"), n)] or [""] * n
         shift = _floats(stated.get("translate"), n) or [0.0] * n
         return [str(a) for a in stated["axes"]], units, _floats(stated["scale"], n) or [1.0] * n, shift
-    above = _metadata(array.place.parent) if array.place.name.startswith("s") else {}
-    size: Any = next((f[k] for f in (facts, above) for k in ("pixelResolution", "resolution") if k in f), None)
+    within = array.place.name.startswith("s")
+    above, finest = (_metadata(array.place.parent / name) if within else {} for name in ("", "s0"))
+    keys = ("pixelResolution", "resolution")
+    size, base = (next((f[k] for f in (one, above) for k in keys if k in f), None) for one in (facts, finest))
+    resized = size not in (None, base)  # a level that states its own size
     unit = next((f["units"] for f in (facts, above) if isinstance(f.get("units"), list)), None)
     if isinstance(size, dict):
         stated_unit = size.get("unit")
@@ -249,7 +252,7 @@ def _transform(array: N5Array, n: int) -> tuple[list[str], list[str], list[float
     levels: list[Any] = next(
         (above[k] for k in ("scales", "downsamplingFactors") if isinstance(above.get(k), list)), []
     )
-    listed = levels[level] if level < len(levels) else None  # of all levels, by the group
+    listed = levels[level] if level < len(levels) and not resized else None  # of all levels, by the group
     factors = _floats(facts.get("downsamplingFactors", listed), spatial) or [1.0] * spatial
     first = _floats(facts.get("offset"), spatial) or [0.0] * spatial
     named = _list(facts.get("axes"), n)  # fastest first, as the sizes

@@ -45,11 +45,12 @@ def read_netcdf(path: Path, options: ReadOptions) -> Volume:
         axes = [axis(name, size) for name, size in zip(variable.dimensions, variable.shape, strict=True)]
         names, inside = str(attributes.get("coordinates", "")).split(), variable.group().variables
         along = set(variable.dimensions)
-        warn_of_curvilinear([n for n in names if n in inside and len({*inside[n].dimensions} & along) > 1], source)
         attributes |= flags_of(getattr(variable.datatype, "enum_dict", None))
         beside = _beside(variable)
         _refuse_mesh(beside, source)
         axes = with_neighbours(axes, beside, source, options.spacing is not None)
+        odd = [n for n in names if n in inside and len({*inside[n].dimensions} & along) > 1]
+        warn_of_curvilinear(odd, axes, source)
         name = f"{volume_name(path)}:{variable.name}"
         where = f"{variable.group().path.rstrip('/')}/{variable.name}"
         by_box = options.stored and options.dims is None and options.component != "magnitude"

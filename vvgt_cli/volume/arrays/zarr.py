@@ -50,9 +50,9 @@ def read_zarr(path: Path, options: ReadOptions) -> Volume:
         axis(str(name or ""), size) for name, size in zip(names, array.shape, strict=True)
     ]
     beside = _beside(zarr, path, place, [a.name for a in axes if a.centres is None])
-    names = str(attributes.get("coordinates", "")).split()
-    warn_of_curvilinear([n for n in names if n in beside and not beside[n].size], str(place))
     axes = with_neighbours(axes, beside, str(place), options.spacing is not None)
+    coordinates = str(attributes.get("coordinates", "")).split()
+    warn_of_curvilinear([n for n in coordinates if n in beside and not beside[n].size], axes, str(place))
     volume = labelled_volume(
         lambda index: np.asarray(array[index]), array.dtype, axes, attributes, options, str(place),
         name_in(path, place), array.chunks,

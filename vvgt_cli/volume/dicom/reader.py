@@ -28,7 +28,7 @@ ANGLE = 1e-3  # of a unit normal: how far slices may be tilted against each othe
 EVEN = 0.01  # of the spacing: how far a slice may be off
 ROUNDED = 0.25  # of the spacing: how far it may be off by the rounding of its position; a missing slice is 0.5
 MOVIE = (0x00181063, 0x00181065)  # Frame Time and its vector: what frames that follow in time are counted by
-_REAL = "RealWorldValueMappingSequence"  # PS3.3, C.7.6.16.2.11
+_REAL = "RealWorldValueMappingSequence"
 _VECTORS = [key for key in ATTRIBUTES if key.endswith("Vector")]  # of frames of nuclear medicine
 CODECS = {  # what pydicom decodes a coding with, by words of its name, the first that fits
     "JPEG-LS": "pyjpegls",
@@ -54,7 +54,8 @@ class _Slice:
         tiles: along each edge of a mosaic; 1 for other images.
         facts: values of the attributes by which volumes of a series differ.
         instance: number of the image in its series, and of the frame in it.
-        real: unit of real-world values (PS3.3, C.7.6.16.2.11), "" if it is 1; None if values are others.
+        real: slope, intercept (NaN in a table) and unit of each mapping to real-world values.
+        scaled: the header states a scale or a unit besides.
     """
 
     source: Source
@@ -68,7 +69,8 @@ class _Slice:
     placed: bool = True
     tiles: int = 1
     facts: dict[str, Any] = field(default_factory=dict)
-    real: str | None = None
+    real: frozenset[tuple[float, float, str]] = frozenset()
+    scaled: bool = False
 
     @property
     def instance(self) -> float:
@@ -95,7 +97,9 @@ def read_dicom(path: Path, options: ReadOptions) -> Volume:
     mosaic = next((_mosaic(file) for file, header in chosen if _is_mosaic(header)), None)
     slices = [s for file, header in chosen for s in _frames(file, header, mosaic, options)]
     slices = one_volume(one_stack(slices, _alike, stack, title, path), options, name, path)
-    slices, unit = in_suv(slices, [header for _, header in chosen], options.suv, path)
+    slices, unit = _in_real_world(slices, path)
+    if unit is None or options.suv == "bw":
+        slices, unit = in_suv(slices, [header for _, header in chosen], options.suv, path)
     normal = np.cross(*slices[0].rows)
     slices.sort(key=lambda s: float(s.position @ normal))
     spacing, direction, heights = _geometry(slices, path, options)
@@ -109,7 +113,7 @@ def read_dicom(path: Path, options: ReadOptions) -> Volume:
         f"{path.resolve().name.removesuffix('.dcm').removesuffix('.zip')}{title}", slope, intercept,
         "LPS" if slices[0].placed else None, all(s.hounsfield for s in slices),
         None if reference is None else str(reference),
-        modality=printable(str(slices[0].header.get("Modality", "")))[:16], value_unit=unit or slices[0].real or "",
+        modality=printable(str(slices[0].header.get("Modality", "")))[:16], value_unit=unit,
     )  # fmt: skip
     return volume if heights is None else _resampled(volume, heights, options, path)
 
@@ -222,7 +226,6 @@ def _frame(source: Source, header: Any, groups: list[Any], k: int, options: Read
     slope, intercept, unit = (
         item("PixelValueTransformationSequence", f"Rescale{w}") for w in ("Slope", "Intercept", "Type")
     )
-    slope, intercept, unit, real = _real_world((*groups, header), slope, intercept, unit)
     scaling = (1.0 if slope is None else float(slope), 0.0 if intercept is None else float(intercept))
     if (dose := header.get("DoseGridScaling")) is not None:
         scaling = (float(dose), 0.0)
@@ -231,29 +234,44 @@ def _frame(source: Source, header: Any, groups: list[Any], k: int, options: Read
     if table is not None:
         scaling, intercept, unit = (1.0, 0.0), 0.0, table.get("ModalityLUTType")
     hounsfield = header.get("Modality") == "CT" and intercept is not None and (unit or HOUNSFIELD) == HOUNSFIELD
+    activity = header.get("Modality") == "PT" and bool(header.get("Units"))
+    scaled = activity or scaling != (1, 0) or unit not in (None, "", "US")  # unspecified
+    real = _mappings((*groups, header)) if dose is None and table is None else frozenset()
     facts = {key: _fact(item(sequence, keyword, key) if sequence else header.get(key), k if key in _VECTORS else None)
              for key, (_, sequence, keyword) in ATTRIBUTES.items()}  # fmt: skip
+    facts = {key: value for key, value in facts.items() if value is not None}
     return _Slice(source, k, header, place, rows, (float(between[1]), float(between[0])), scaling, hounsfield, placed,
-                  facts={key: value for key, value in facts.items() if value is not None}, real=real)  # fmt: skip
+                  facts=facts, real=real, scaled=scaled)  # fmt: skip
 
 
-def _real_world(groups: Sequence[Any], slope: Any, intercept: Any, unit: Any) -> tuple[Any, Any, Any, str | None]:
-    """Return slope, intercept and type of values, of a mapping to real-world values where none but 1, 0 are stated.
+def _mappings(groups: Sequence[Any]) -> frozenset[tuple[float, float, str]]:
+    """Return slope, intercept and unit of the mappings to real-world values (PS3.3, C.7.6.16.2.11)."""
+    found = set()
+    for mapping in next((group[_REAL] for group in groups if group.get(_REAL)), ()):
+        code = str((mapping.get("MeasurementUnitsCodeSequence") or [{}])[0].get("CodeValue", ""))
+        unit = "" if code == "1" else printable(code)[:40].replace("[hnsf'U]", HOUNSFIELD)
+        numbers = (mapping.get(f"RealWorldValue{word}") for word in ("Slope", "Intercept"))
+        slope, intercept = (math.nan if number is None else float(number) for number in numbers)
+        found.add((slope, intercept, unit))
+    return frozenset(found)
 
-    The fourth is `_Slice.real`. A warning says if another scale is stated.
+
+def _in_real_world(slices: list[_Slice], path: Path) -> tuple[list[_Slice], str | None]:
+    """Return slices whose ``scaling`` gives real-world values, and their unit, if all slices can be mapped to one.
+
+    Otherwise, as where another scale is stated or a slice has several mappings, slices stay as they are, and the unit
+    is None; a warning says so unless the scales are the same.
     """
-    mapping = next((group[_REAL][0] for group in groups if group.get(_REAL)), None)
-    if mapping is None or any(groups[-1].get(key) is not None for key in ("DoseGridScaling", "ModalityLUTSequence")):
-        return slope, intercept, unit, None
-    real = [mapping.get(f"RealWorldValue{w}") for w in ("Slope", "Intercept")]
-    stated = [1.0 if slope is None else float(slope), float(intercept or 0)]
-    if None in real or stated != [1.0, 0.0] or unit not in (None, "", "US"):  # unspecified
-        if stated != real:
-            warnings.warn("DICOM: its RealWorldValueMapping is not applied, but its rescale slope", stacklevel=4)
-        return slope, intercept, unit, None
-    codes = mapping.get("MeasurementUnitsCodeSequence") or [{}]
-    code = printable(str(codes[0].get("CodeValue", "")))[:40].replace("[hnsf'U]", HOUNSFIELD)
-    return *real, code or "?", "" if code == "1" else code
+    mappings = [next(iter(s.real)) for s in slices if len(s.real) == 1 and not s.scaled]
+    numbers = [mapping[:2] for mapping in mappings]
+    units = {unit for _, _, unit in mappings}
+    if len(mappings) == len(slices) and len(units) == 1 and np.isfinite(numbers).all():
+        unit = units.pop()
+        hounsfield = unit == HOUNSFIELD and slices[0].header.get("Modality") == "CT"
+        return [replace(s, scaling=n, hounsfield=hounsfield) for s, n in zip(slices, numbers, strict=True)], unit
+    if not all(np.allclose(mapping[:2], s.scaling, rtol=1e-6, atol=0) for s in slices for mapping in s.real):
+        warnings.warn(f"{path}: its RealWorldValueMapping is not applied", stacklevel=3)
+    return slices, None
 
 
 def _fact(value: Any, k: int | None) -> Any:
@@ -411,10 +429,11 @@ def _decoded(one: _Slice) -> np.ndarray:
 
     dataset = read_file(one.source)
     stored, high = (one.header.get(key) for key in ("BitsStored", "HighBit"))
-    if None not in (stored, high) and high != stored - 1:
+    packed = dataset.file_meta.TransferSyntaxUID.is_compressed  # a codec has bits of its own
+    if not packed and None not in (stored, high) and high != stored - 1:
         raise DataError(
-            f"{one.source}: HighBit {high} with BitsStored {stored}; expected {stored - 1} (DICOM, PS3.5, 8.1.1): try "
-            "gdcmconv --raw"
+            f"{one.source}: HighBit {high} with BitsStored {stored}; expected {stored - 1} (DICOM, PS3.5, 8.1.1): "
+            "export it again with values in the low bits"
         )
     try:
         values: np.ndarray = dataset.pixel_array

@@ -22,7 +22,7 @@ import numpy as np
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.volume.blocks import Packed, check_memory, count, data_file, load_block
-from vvgt_cli.volume.headers import MARK, MAX_HEADER, HeaderFields
+from vvgt_cli.volume.headers import MARK, MAX_HEADER, HeaderFields, printable
 from vvgt_cli.volume.reading import ReadOptions, Segment, Volume, segments_in, select_component, triple, volume_name
 from vvgt_cli.volume.space import MILLIMETRE, metres, one_unit, placed, unit_rows
 
@@ -255,7 +255,7 @@ def _volume(path: Path, fields: HeaderFields, block: np.ndarray, sizes: list[int
     place = _place(fields, vectors, axis, sizes, options) | {"options": options, "name": volume_name(path)}
     if "oldmin" in fields or "oldmax" in fields:
         warnings.warn(f"{path}: old min and old max are not applied to its quantized values, as in ITK", stacklevel=2)
-    place["value_unit"] = _words(fields, "sampleunits")[0][:40] if fields.get("sampleunits") else ""
+    place["value_unit"] = printable(_words(fields, "sampleunits")[0])[:40] if fields.get("sampleunits") else ""
     if any(_SEGMENT.fullmatch(key) for key in fields):
         layer = options.component if isinstance(options.component, int) else None
         place["segments"] = segments_in(lambda: segments(fields, layer), str(path))

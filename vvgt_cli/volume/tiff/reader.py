@@ -28,14 +28,14 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.microscopy.image import Micrograph, choose_image, picture_volume
-from vvgt_cli.volume.reading import ReadOptions, Slices, Volume, metres, size_text, triple, volume_name
+from vvgt_cli.volume.reading import ReadOptions, Slices, Volume, metres, printable, size_text, triple, volume_name
 from vvgt_cli.volume.tiff.decode import Pages
 from vvgt_cli.volume.tiff.ome import ome_tag, open_tiff
 from vvgt_cli.volume.tiff.pages import check_pages
 
 _SIZES = {  # tags of programs that state voxel sizes in forms that are not read
     33550: "ModelPixelScale", 34264: "ModelTransformation", 34412: "CZ_LSMINFO", 34118: "CZ_SEM", 34680: "FEI_SFEG",
-    34682: "FEI_TITAN", 51123: "MicroManagerMetadata",
+    34682: "FEI_TITAN", 51123: "MicroManagerMetadata", 33628: "UIC1tag", 33629: "UIC2tag",
 }  # fmt: skip
 _NODATA = 42113  # of GDAL
 _AXES = {"X": "columns", "Y": "rows", "Z": "slices", "T": "time steps", "C": "channels", "S": "samples"}
@@ -91,7 +91,8 @@ def read_tiff(path: Path, options: ReadOptions, slices: int = 1) -> Volume:
 
     Spacing is in micrometres where OME-XML or ImageJ's description has one, else 1.
 
-    A volume has so many ``slices`` if the file is one of them.
+    A volume has so many ``slices`` if the file is the first of them; 0 for the others, which say nothing of what the
+    first has said.
     """
     check_pages(path)
     with _silent(), open_tiff(path) as file, Pages(path) as pages:
@@ -110,7 +111,8 @@ def read_tiff(path: Path, options: ReadOptions, slices: int = 1) -> Volume:
             facts.spacing, names=facts.channels, colors=facts.colors, rgb=layout.color, samples=bool(layout.of("S")),
             mapped=mapped is not None,
         )  # fmt: skip
-        _warn_of_unread(series.keyframe.tags, facts, options, path)
+        if slices:
+            _warn_of_unread(series.keyframe.tags, facts, options, path)
         if mapped is None:
             _whole(series, path)
         volume = picture_volume(picture, replace(options, stored=stored), str(path), volume_name(path))
@@ -124,14 +126,14 @@ def read_tiff(path: Path, options: ReadOptions, slices: int = 1) -> Volume:
 
 
 def _warn_of_unread(tags: Any, facts: Facts, options: ReadOptions, path: Path) -> None:
-    """Warn of tags that state sizes, where no others do, or missing values, and are not read."""
-    if options.spacing is not None:
-        return
+    """Warn of a calibration, tags that state sizes, where no others do, or missing values, which are not read."""
+    if facts.function is not None:
+        warnings.warn(f"{path}: values are not calibrated as ImageJ's function {facts.function!r} says", stacklevel=3)
     names = [name for code, name in _SIZES.items() if code in tags]
-    if names and facts.spacing == (None, None, None):
+    if names and facts.spacing == (None, None, None) and options.spacing is None:
         warnings.warn(f"{path}: sizes in {', '.join(names)} are not read; --spacing X Y Z sets them", stacklevel=3)
-    if _NODATA in tags:
-        value = str(tags[_NODATA].value).strip("\0 ")[:20]
+    value = printable(str(tags.valueof(_NODATA, default="")).strip("\0 "))[:20]
+    if value.lower() not in ("", "nan"):
         warnings.warn(f"{path}: voxels of {value} (GDAL_NODATA) are read as values, not as missing", stacklevel=3)
 
 
@@ -197,8 +199,8 @@ def _facts(file: Any, root: Any, series: Any, number: int, path: Path) -> Facts:
         first = file.pages.first
         x, y = (r if code in first.tags else None for code, r in zip((282, 283), first.get_resolution(), strict=True))
         description = imagej_facts(file.imagej_metadata or {}, (x, y), int(first.tags.valueof(296, default=1)))
-        scaling, value_unit = _calibration(file.imagej_metadata or {}, path)
-        facts = replace(description, channels=facts.channels, scaling=scaling, value_unit=value_unit)
+        kind = "colours" if series.keyframe.photometric == 2 else np.dtype(series.dtype).name
+        facts = replace(description, channels=facts.channels, **_calibration(file.imagej_metadata or {}, kind))
         if facts.images > 1 and series.kind != "imagej" and root is None:
             short = first.dataoffsets[0] + facts.images * first.nbytes - path.stat().st_size if first.is_final else 0
             missing = f" ({size_text(short)} are missing)" if short > 0 else ""
@@ -284,6 +286,7 @@ class Facts:
         length: unit of the spacing, "um" or unknown.
         scaling: slope and intercept of the values.
         value_unit: unit of the values; "" unknown.
+        function: ImageJ's function that would calibrate the values, which is not read; None if there is none.
     """
 
     spacing: tuple[float | None, float | None, float | None] = (None, None, None)
@@ -295,6 +298,7 @@ class Facts:
     length: str = ""
     scaling: tuple[float, float] = (1.0, 0.0)
     value_unit: str = ""
+    function: Any = None
 
     def doubts(self, options: ReadOptions, slices: int, source: str) -> list[str]:
         """Return what is assumed for the spacing; raise UsageError if it is unusable and none is given."""
@@ -382,19 +386,22 @@ def imagej_facts(stated: dict[str, Any], resolution: tuple[float | None, float |
     return replace(facts, images=images, assumed=tuple(assumed))
 
 
-def _calibration(stated: dict[str, Any], path: Path) -> tuple[tuple[float, float], str]:
-    """Return slope, intercept and unit of values by ImageJ's calibration, a straight line (ij.measure.Calibration).
+def _calibration(stated: dict[str, Any], kind: str) -> dict[str, Any]:
+    """Return the `Facts` of values of a ``kind`` by ImageJ's calibration, as ImageJ reads it (ij.io.FileOpener, 1.54).
 
-    So it writes signed values, which it stores as unsigned. Any other function is not applied, and a warning says so.
+    A straight line is applied (ij.measure.Calibration): so it writes signed values, which it stores as unsigned; it
+    reads signed ones as unsigned, too. Values of 32 bits have a unit alone, colours nothing.
     """
-    if "cf" not in stated or stated["cf"] in (20, 21):  # none
-        return (1.0, 0.0), ""
-    unit = str(stated.get("vunit", ""))[:40]
+    unit = printable(str(stated.get("vunit", "")))[:40]
+    facts: dict[str, Any] = {"value_unit": "" if unit == "Gray Value" else unit}
+    if kind not in ("uint8", "uint16", "int16"):
+        return {} if kind == "colours" else facts
+    if stated.get("cf", 20) == 20:  # none
+        return {}
     offset, slope = (n if isinstance(n := stated.get(key), int | float) else math.nan for key in ("c0", "c1"))
     if stated["cf"] != 0 or not slope or not math.isfinite(slope + offset) or "c2" in stated:
-        warnings.warn(f"{path}: values are not calibrated as ImageJ's function {stated['cf']} says", stacklevel=4)
-        return (1.0, 0.0), ""
-    return (float(slope), float(offset)), "" if unit == "Gray Value" else unit
+        return {"function": stated["cf"]}
+    return facts | {"scaling": (float(slope), float(offset + (32768 * slope if kind == "int16" else 0)))}
 
 
 def count_planes(file: Any) -> None:

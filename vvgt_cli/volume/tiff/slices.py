@@ -63,8 +63,8 @@ def read_slices(files: list[Path], options: ReadOptions, source: str, name: str)
         warnings.warn(f"{source}: skipped {names}: not of the format of most slices", stacklevel=2)
     files, step = in_order(files, source)
 
-    def page(path: Path, slices: int = 1) -> Volume:
-        how = replace(options, stored=False, spacing=options.spacing if slices > 1 else (1.0, 1.0, 1.0))
+    def page(path: Path, slices: int = 0) -> Volume:
+        how = replace(options, stored=False, spacing=options.spacing if slices else (1.0, 1.0, 1.0))
         volume = read_tiff(path, how, slices)
         if volume.data.shape[0] != 1:
             text = f"{path}: {volume.data.shape[0]} slices in one of {len(files)} files; expected one slice a file"
