@@ -24,7 +24,7 @@ LINES = (
     ".map((line) => ['x1', 'y1', 'x2', 'y2'].map((name) => Number(line.getAttribute(name))))"
 )
 CONTROLS = (
-    "[...document.querySelectorAll('#slices :is(input, select, button, canvas)')].filter((e) => !e.closest('[hidden]'))"
+    "[...document.querySelectorAll('#slices :is(input, select, button, canvas)')].filter((e) => e.checkVisibility())"
 )
 AXES = ((0, 1), (0, 2), (1, 2))  # of RAS: to the left of the body and up, of axial, coronal, sagittal
 NAMES = "axial", "coronal", "sagittal"
@@ -64,6 +64,12 @@ def opened(person: Person, page: str) -> list[list[float]]:
     return list(person("eval", RECTS))
 
 
+def measure(person: Person) -> None:
+    person("press", "m")
+    if person.touch:  # measuring goes on where another tab shows slices
+        person("click", "#tabs button:text-is('slices')")
+
+
 def test_values_and_greys_are_those_of_the_file(marked: str, person: Person, tmp_path: Path) -> None:
     """At 20 places of each slice, of a volume that is mirrored and oblique."""
     scan, rng = scan_of(marked), np.random.default_rng(1)
@@ -92,12 +98,13 @@ def test_values_and_greys_are_those_of_the_file(marked: str, person: Person, tmp
                 value = value_said(person)
             assert value == pytest.approx(wanted, abs=step), (name, index)
             around = scan.data[tuple(slice(k - 1, k + 2) for k in index)]
-            if np.ptp(around) == 0:
+            _, top, _, high = rects[view]
+            if np.ptp(around) == 0 and top + 45 < place[1] < top + high - 25:  # between the letters and the scale bar
                 x, y = np.round(place).astype(int)
                 grey = np.clip((wanted - (level - window / 2)) / window, 0, 1)
                 assert picture[y, x] == pytest.approx(np.full(3, grey), abs=0.02), (name, index)
                 checked += 1
-    assert checked > 25
+    assert checked > (10 if person.touch else 25)
 
 
 def _found(scan: Scan, index: np.ndarray) -> str:
@@ -201,7 +208,7 @@ def test_labels_are_drawn_over_the_values_as_their_list_shows_them(person: Perso
     person("eval", f"{look}.set([{{ number: 3, color: [0, 0, 1], opacity: 0.5 }}])")
     np.testing.assert_allclose(color(16, 6), (grey / 2, grey / 2, grey / 2 + 0.5), atol=0.02)
     person("click", left + wide / 2 - 4 * scale, top + high / 2 + 5 * scale)
-    assert re.search(r": 100, (3|lobe|label 3)$", person("eval", SAID))
+    assert re.search(": 100, labels$", person("eval", SAID))
     person("eval", f"{look}.set([{{ number: 3, opacity: 0 }}])")
     np.testing.assert_allclose(color(16, 6), np.full(3, np.clip(grey, 0, 1)), atol=0.02)
 
@@ -260,7 +267,7 @@ def test_panels_lie_beside_the_buttons(marked: str, person: Person, tmp_path: Pa
 
 def test_damaged_slices_are_said_to_be(marked: str, person: Person, tmp_path: Path) -> None:
     text = Path(marked.removeprefix("file://")).read_text("utf-8")
-    (tmp_path / "cut.html").write_text(re.sub(r'(id="slices-0">[^<]{400})[^<]+', r"\1", text), "utf-8")
+    (tmp_path / "cut.html").write_text(re.sub(r'(id="values-0">[^<]{400})[^<]+', r"\1", text), "utf-8")
     opened(person, (tmp_path / "cut.html").as_uri())
     assert person("eval", SAID).startswith("The slices cannot be shown")
     assert person("eval", "window.vvgt.where.link()").count("slices=") == 0
@@ -297,9 +304,7 @@ def test_a_slice_is_enlarged_by_clicks_button_and_key(marked: str, person: Perso
     assert person("eval", f"[...{STATE}, document.querySelector('#slices').hidden]") == [1, "", 25, False]
     person("open", link)
     assert len(person("eval", BOX)) == 1
-    person("press", "m")  # two clicks are two points then
-    if person.touch:  # measuring goes on where another tab shows slices
-        person("click", "#tabs button:text-is('slices')")
+    measure(person)  # two clicks are two points then
     left, top, wide, high = person("eval", BOX)[0]
     person("twice", left + wide / 2, top + high / 2)
     assert person("eval", "[window.vvgt.where.slices.state.large, window.vvgt.where.marks.list.length]") == [
@@ -357,7 +362,7 @@ def test_a_ruler_of_a_slice_is_drawn_in_its_plane_alone(marked: str, person: Per
         ]
         return int(((picture[..., 0] > 0.9) & (picture[..., 2] < 0.4)).sum())
 
-    person("press", "m")
+    measure(person)
     ends = [(left + share * wide, top + 0.45 * high) for share in (0.35, 0.62)]
     assert yellow() == 0
     person("click", *ends[0])
