@@ -117,13 +117,19 @@ def test_pressure_points_down_and_other_directions_are_said(tmp_path: Path) -> N
         read_volume(write_netcdf(tmp_path / "u.nc", "depth", STEPS, units="m"))
 
 
-@pytest.mark.parametrize(("names", "placed"), [("lon lat", "z"), ("lon lat", "zji"), ("valid_time", "z")])
+@pytest.mark.parametrize(
+    ("names", "placed"),
+    [("nav_lon nav_lat", "z"), ("lon lat", "zji"), ("lon lat", "zJI"), ("valid_time platform", "z")],
+)
 def test_curvilinear_places_are_said(tmp_path: Path, names: str, placed: str) -> None:
     with netCDF4.Dataset(tmp_path / "v.nc", "w") as file:
         for name, n in (("z", 4), ("j", 5), ("i", 6)):
             file.createDimension(name, n)
-        for name in placed:  # j and i of a projection
+        for letter in placed:  # J and I of a projection, j and i that count cells
+            name = letter.lower()
             file.createVariable(name, "f8", (name,))[:] = np.arange(file.dimensions[name].size)
+            if letter in "JI":
+                file[name].axis = {"J": "Y", "I": "X"}[letter]
         for name in names.split():
             file.createVariable(name, "f4", ("j", "i"))[:] = 0
         file.createVariable("t", "f4", ("z", "j", "i"))[:] = COUNT
@@ -132,7 +138,8 @@ def test_curvilinear_places_are_said(tmp_path: Path, names: str, placed: str) ->
         warnings.simplefilter("always")
         read_volume(str(tmp_path / "v.nc"))
     found = [re.search(r"curvilinear \((.*)\), which is not read.*cdo remapbil", str(one.message)) for one in told]
-    assert [one[1] for one in found if one] == (["lon, lat"] if (names, placed) == ("lon lat", "z") else [])
+    said = [] if placed == "zJI" or "time" in names else [", ".join(names.split())]
+    assert [one[1] for one in found if one] == said
 
 
 @pytest.mark.parametrize("suffix", [".nc", ".h5"])

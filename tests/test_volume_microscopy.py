@@ -217,6 +217,10 @@ def test_n5_levels_and_what_is_refused(vvgt, store: Path, tmp_path: Path) -> Non
         assert (coarse.spacing, coarse.origin) == ((1.0, 2.0, 2.0), (10.25, 20.5, 30.0))
     facts.write_text(json.dumps(told | {"pixelResolution": {"unit": "um", "dimensions": [1, 2, 2]}}))  # its own
     assert read_volume(str(tmp_path / "p.n5"), ReadOptions(level=1)).spacing == (1.0, 2.0, 2.0)
+    finest = tmp_path / "p.n5" / "s0" / "attributes.json"
+    same = json.loads(finest.read_text()) | {"pixelResolution": [1, 2, 2]}  # as a list
+    finest.write_text(json.dumps(same))
+    assert read_volume(str(tmp_path / "p.n5"), ReadOptions(level=1)).spacing == (2.0, 4.0, 2.0)
     block = store / "raw" / "0" / "0" / "0"
     block.write_bytes(block.read_bytes()[:-4])
     refused(DataError, r"its .4, 4, 4. values need 256", read_volume, f"{store}:/raw")

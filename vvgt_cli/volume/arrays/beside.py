@@ -21,7 +21,7 @@ _LETTER = re.compile(r"(?:(?:coord(?:inate)?s?|grid|axis)_?)?([xyzt])[ _([]*(\w*
 _SUFFIXES = re.compile(r"|s|c|v|ax(?:is|es)|grid|(?:coord(?:inate)?|cent(?:er|re)|value|val|pos(?:ition)?)s?", re.I)
 _NUMBERED = re.compile(r"(?:dim|axis|coord)_?(\d)", re.I)
 _GEOMETRY = {re.sub("_", "", word.lower()) for word in GEOMETRY}
-_PLACE = re.compile("lon|lat|^[xy]c?$", re.I)  # of two axes
+_PLACE = re.compile(r"(?:\w*_)?(?:[a-z]|geo)?(?:lon|lat)(?:g|itude)?s?(?:_\w+|\d*)|[xy]c?|g(?:lam|phi)[tuvf]", re.I)
 _PLACES = re.compile(r"(?:particles?_?)?(?:coord(?:inate)?s?|pos(?:ition)?s?|xyz)", re.I)
 _VECTORS = re.compile(r"(?:particles?_?)?(?:vel(?:ocity|ocities)?|accelerations?|forces?|moment(?:um|a))", re.I)
 
@@ -95,8 +95,8 @@ def warn_of_curvilinear(odd: Sequence[str], axes: Sequence[Axis], source: str) -
 
     ``odd`` names all such coordinates.
     """
-    places = [name for name in odd if _PLACE.search(name)]
-    if places and sum(a.centres is not None and a.role not in ("z", "t", "c") for a in axes) < 2:
+    places = [name for name in odd if _PLACE.fullmatch(name)]
+    if places and sum(a.centres is not None and a.role in ("x", "y") for a in axes) < 2:
         warnings.warn(
             f"{source}: its places are curvilinear ({', '.join(places)}), which is not read: voxels lie on an even "
             "grid of its axes (cdo remapbil or Resample in ParaView makes a regular one)", stacklevel=3,

@@ -14,7 +14,7 @@ import math
 import re
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -239,15 +239,19 @@ def _transform(array: N5Array, n: int) -> tuple[list[str], list[str], list[float
         return [str(a) for a in stated["axes"]], units, _floats(stated["scale"], n) or [1.0] * n, shift
     within = array.place.name.startswith("s")
     above, finest = (_metadata(array.place.parent / name) if within else {} for name in ("", "s0"))
-    keys = ("pixelResolution", "resolution")
-    size, base = (next((f[k] for f in (one, above) for k in keys if k in f), None) for one in (facts, finest))
-    resized = size not in (None, base)  # a level that states its own size
-    unit = next((f["units"] for f in (facts, above) if isinstance(f.get("units"), list)), None)
-    if isinstance(size, dict):
-        stated_unit = size.get("unit")
-        size, unit = size.get("dimensions"), [stated_unit] * 3
     spatial = min(n, 3)
-    steps = _floats(size, spatial) or [1.0] * spatial
+
+    def stated_size(*places: Mapping[str, Any]) -> Any:
+        return next((one[key] for one in places for key in ("pixelResolution", "resolution") if key in one), None)
+
+    def lengths(size: Any) -> list[float]:
+        return _floats(size.get("dimensions") if isinstance(size, dict) else size, spatial)
+
+    own, size = stated_size(facts), stated_size(facts, above)
+    resized = own is not None and lengths(own) != lengths(stated_size(finest, above))  # a level of a size of its own
+    unit = next((f["units"] for f in (facts, above) if isinstance(f.get("units"), list)), None)
+    unit = [size.get("unit")] * 3 if isinstance(size, dict) else unit
+    steps = lengths(size) or [1.0] * spatial
     level = int(array.place.name[1:]) if re.fullmatch(r"s\d{1,3}", array.place.name) else 0
     levels: list[Any] = next(
         (above[k] for k in ("scales", "downsamplingFactors") if isinstance(above.get(k), list)), []

@@ -429,7 +429,8 @@ def _decoded(one: _Slice) -> np.ndarray:
 
     dataset = read_file(one.source)
     stored, high = (one.header.get(key) for key in ("BitsStored", "HighBit"))
-    packed = dataset.file_meta.TransferSyntaxUID.is_compressed  # a codec has bits of its own
+    syntax = dataset.file_meta.TransferSyntaxUID
+    packed = not syntax.is_transfer_syntax or syntax.is_compressed  # a codec has bits of its own
     if not packed and None not in (stored, high) and high != stored - 1:
         raise DataError(
             f"{one.source}: HighBit {high} with BitsStored {stored}; expected {stored - 1} (DICOM, PS3.5, 8.1.1): "
@@ -438,7 +439,6 @@ def _decoded(one: _Slice) -> np.ndarray:
     try:
         values: np.ndarray = dataset.pixel_array
     except (NotImplementedError, RuntimeError) as error:  # a codec that pydicom does not have
-        syntax = dataset.file_meta.TransferSyntaxUID
         package = next((package for name, package in CODECS.items() if name in syntax.name), None)
         raise DataError(
             f"{one.source}: pixels coded as {syntax.name} cannot be decoded ({' '.join(str(error).split())[:200]}); "

@@ -398,7 +398,8 @@ def _calibration(stated: dict[str, Any], kind: str) -> dict[str, Any]:
         return {} if kind == "colours" else facts
     if stated.get("cf", 20) == 20:  # none
         return {}
-    offset, slope = (n if isinstance(n := stated.get(key), int | float) else math.nan for key in ("c0", "c1"))
+    numbers = (stated.get(key) for key in ("c0", "c1"))
+    offset, slope = (n if isinstance(n, int | float) and abs(n) < 1e30 else math.nan for n in numbers)
     if stated["cf"] != 0 or not slope or not math.isfinite(slope + offset) or "c2" in stated:
         return {"function": stated["cf"]}
     return facts | {"scaling": (float(slope), float(offset + (32768 * slope if kind == "int16" else 0)))}
