@@ -1,4 +1,4 @@
-"""What web viewers draw of a volume's Gaussians, unlit and lit, in every format that they read: docs/viewers.md.
+"""What web viewers draw of a volume's Gaussians, unlit and lit, in every format that they read: docs/log/viewers.md.
 
 python benchmarks/viewers.py VOLUME [--tf TF] [--viewer NAME]... [--format .spz]... --pictures FOLDER [--page PAGE]
 
