@@ -3,7 +3,8 @@
     PYTHONPATH=. python benchmarks/light_paths.py SCENES.tsv DATA_DIR TF_DIR --size 64 --paths 4096 -o light-paths.csv
 
 `grid_db`: dB over RGB of the ray-cast view (test view 3, 3 x 3 rays a pixel) against the picture of paths; `noise_db`:
-of the latter, from its halves; `light_seconds`: processor time of the grid. Repeat `--paths` for a curve.
+of the latter, from its halves; `light_seconds`: processor time of the grid. Repeat `--paths` for a curve over the
+paths from the eye, and `--effort` for one over those that make the grid, whose number it multiplies.
 With `--gaussians K`, `ply_db` of a conversion for a screen of this size, and `ply_grid_db` beside the view, too; all
 are then without the noise of the paths: the mean of the product of the differences from the two halves.
 With `--pictures DIR` no rows, but a JPEG a scene: unlit, under a headlight, and under the first sky.
@@ -15,6 +16,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import click
 import numpy as np
@@ -24,12 +26,17 @@ from floors import machine
 import vvgt_cli as vvgt
 from tests.paths_twin import path_view
 from vvgt_cli.cameras import Camera, default_views
-from vvgt_cli.dvr import RenderSettings, Scene, render_view
+from vvgt_cli.dvr import RenderSettings, Scene, render_view, traced
 from vvgt_cli.dvr.sky import sky_of
 from vvgt_cli.field.source import StyledVolume
 from vvgt_cli.library.inputs import Look
 from vvgt_cli.look.lighting import SKIES, LightOptions
 from vvgt_cli.splat.render import render
+
+EFFORT = {
+    "POINTS": lambda effort: traced.POINTS * effort,
+    "MOST_PATHS": lambda effort: round(traced.MOST_PATHS * effort),
+}
 
 
 def decibels(error: np.ndarray, other: np.ndarray | None = None) -> float:
@@ -46,31 +53,40 @@ def converted(source: StyledVolume, light: str, size: int, gaussians: int, camer
 
 
 def measure(
-    source: StyledVolume, name: str, size: int, counts: tuple[int, ...], gaussians: int | None
+    source: StyledVolume,
+    name: str,
+    size: int,
+    counts: tuple[int, ...],
+    efforts: tuple[float, ...],
+    gaussians: int | None,
 ) -> Iterator[dict[str, Any]]:
-    """A row for each number of paths a pixel."""
+    """A row for each effort and number of paths a pixel."""
     scene = source.scene()
     lighting = LightOptions((name,)).lighting(None, scene.volume.space)
     assert lighting is not None
-    began = time.process_time()
-    lit = scene.lit(lighting)
-    spent, camera = time.process_time() - began, default_views("test", size=size)[3]
-    image = render_view(lit, camera, RenderSettings(samples=3))
+    camera = default_views("test", size=size)[3]
     sky = sky_of(name, np.array(lighting.directions[0]), scene.volume.axes)
-    shown = {"grid_db": image}
-    if gaussians:
-        shown["ply_db"] = converted(source, name, size, gaussians, camera)
-    for paths in counts:
-        halves = [path_view(scene.scattering(), sky, scene.half, camera, paths // 2, seed) for seed in (1, 1 << 20)]
-        traced = (halves[0] + halves[1]) / 2
-        noise = decibels((halves[0] - halves[1]) / 2)
-        row: dict[str, Any] = {"paths": paths}
-        for key, one in shown.items():
-            first, second = (one - half for half in halves) if gaussians else (one - traced,) * 2
-            row[key] = decibels(first, second)
+    pairs = [
+        [path_view(scene.scattering(), sky, scene.half, camera, n // 2, seed) for seed in (1, 1 << 20)] for n in counts
+    ]
+    for effort in efforts:
+        began = time.process_time()
+        with mock.patch.multiple(traced, **{key: value(effort) for key, value in EFFORT.items()}):
+            lit = scene.lit(lighting)
+        spent = time.process_time() - began
+        image = render_view(lit, camera, RenderSettings(samples=3))
+        shown = {"grid_db": image}
         if gaussians:
-            row["ply_grid_db"] = decibels(shown["ply_db"] - image)
-        yield row | {"noise_db": noise, "light_seconds": spent}
+            shown["ply_db"] = converted(source, name, size, gaussians, camera)
+        for paths, halves in zip(counts, pairs, strict=True):
+            traced_view, noise = (halves[0] + halves[1]) / 2, decibels((halves[0] - halves[1]) / 2)
+            row: dict[str, Any] = {"effort": effort, "paths": paths}
+            for key, one in shown.items():
+                first, second = (one - half for half in halves) if gaussians else (one - traced_view,) * 2
+                row[key] = decibels(first, second)
+            if gaussians:
+                row["ply_grid_db"] = decibels(shown["ply_db"] - image)
+            yield row | {"noise_db": noise, "light_seconds": spent}
 
 
 def picture(scene: Scene, sky: str, size: int, target: Path) -> None:
@@ -93,12 +109,13 @@ def picture(scene: Scene, sky: str, size: int, target: Path) -> None:
 @click.option("--size", type=int, default=64)
 @click.option("--sky", "skies", multiple=True, default=SKIES)
 @click.option("--paths", type=int, multiple=True, default=(512,))
+@click.option("--effort", "efforts", type=float, multiple=True, default=(1.0,))
 @click.option("--gaussians", type=int)
 @click.option("-o", "--output", type=click.Path())
 @click.option("--pictures", type=click.Path(file_okay=False))
 def main(
     places: tuple[str, str, str], scenes: tuple[str, ...], size: int, skies: tuple[str, ...], paths: tuple[int, ...],
-    gaussians: int | None, output: str | None, pictures: str | None,
+    efforts: tuple[float, ...], gaussians: int | None, output: str | None, pictures: str | None,
 ) -> None:  # fmt: skip
     rows: list[dict[str, Any]] = []
     for name, source in read_scenes(*places, scenes or None):
@@ -106,7 +123,7 @@ def main(
             picture(source.scene(), skies[0], size, Path(pictures) / f"{name}-{skies[0]}.jpg")
             continue
         for sky in skies:
-            for row in measure(source, sky, size, paths, gaussians):
+            for row in measure(source, sky, size, paths, efforts, gaussians):
                 rows.append({"scene": name, "sky": sky, **row, "size": size, "commit": commit()})
                 rows[-1]["machine"] = machine().split(", load")[0]
                 print(rows[-1], flush=True)

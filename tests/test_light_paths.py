@@ -12,7 +12,7 @@ from tests.test_light import blob, camera, function
 from vvgt_cli.dvr import RenderSettings, Scene, render_view, render_view_reference
 from vvgt_cli.dvr.light import sphere
 from vvgt_cli.dvr.sky import COLUMNS, ROWS, Sky, directions, sky_of
-from vvgt_cli.dvr.traced import lines
+from vvgt_cli.dvr.traced import _doubled, _halved, lines
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.open import FieldNeeds, _settings
 from vvgt_cli.field.source import SourceRequest
@@ -183,6 +183,29 @@ def test_views_show_the_light_of_paths():
     assert np.abs(render_view(lit, camera(12), RenderSettings(step=0.125, samples=1)) - twin).max() < 5e-3
     again = scene.lit(lighting)
     np.testing.assert_array_equal(again.light.shade, lit.light.shade)
+
+
+def test_views_lose_no_light_where_colors_vary_along_a_ray():
+    """Views add up powers of colours, whose mean is below the power of the mean: cells make up for it."""
+    values = np.random.default_rng(2).random((16, 16, 16)).astype(np.float32)
+    layers = [[1, 0.1, 0.1], [1, 0.1, 0.1], [0.1, 1, 0.1], [0.1, 1, 0.1]]
+    scene = Scene.build(Volume(values), function([0, 0.4, 0.5, 1], [0.02, 0.02, 0.1, 0.1], layers), 1.0)
+    lighting, view = LightOptions(("overcast",)).lighting(None, None), camera(24)
+    sky = sky_of("overcast", np.array(lighting.directions[0]), scene.volume.axes)
+    traced = paths_twin.path_view(scene.scattering(), sky, scene.half, view, 400)[..., :3]
+    image = render_view(scene.lit(lighting), view, RenderSettings(samples=3))[..., :3]
+    inside = traced.min(axis=2) > 0.5 * traced.min(axis=2).max()
+    ratio = (image[inside] / traced[inside]).mean(axis=0)
+    assert ratio.min() > 0.85  # 0.60 without
+    assert ratio.max() < 1.05
+
+
+def test_what_cells_gather_is_handed_down_and_up_by_the_same_weights():
+    fine, coarse = np.random.default_rng(0).random((3, 7, 6)), np.random.default_rng(1).random((3, 4, 6))
+    down, up = _halved(fine, 1, 0.75, 0.25), _doubled(coarse, 1, 7)
+    assert (down.shape, up.shape) == (coarse.shape, fine.shape)
+    assert (down * coarse).sum() == pytest.approx((fine * up).sum())
+    np.testing.assert_allclose(_doubled(np.ones((3, 4, 6)), 1, 8), 1)
 
 
 @pytest.mark.parametrize("values", [np.zeros((5, 4, 6)), np.ones((5, 4, 6)), np.full((3, 3, 3), np.nan)])

@@ -14,10 +14,10 @@ from vvgt_cli.dvr.sky import Sky
 DENSEST = 64.0  # optical depth a voxel: denser matter is as opaque, and would take as many steps more
 RAYS = 1 << 18  # that are cast at once
 MOST_RAYS = 1 << 23
-POINTS = 3  # a cell that views see
+POINTS = 12  # a cell that views see
 MOST_PATHS = 1 << 20
-ERROR = 0.1  # of a cell's light, at which no more paths are begun
-FIRST = 1  # paths of a point before others follow where they vary
+TRIES = 8  # scatterings of a ray that are looked for
+FAINTEST = 1e-3  # colour of a ray below which nobody sees what it loses
 SEED = 1
 
 
@@ -109,8 +109,9 @@ def lines(shape: Sequence[int], step: np.ndarray, count: int, rng: np.random.Gen
 def light_grid(matter: Scattering, sky: Sky, shape: Sequence[int], cell: int) -> np.ndarray:
     """Return the light that views see matter in, (3, cz, cy, cx) float32, to the power that colours are in.
 
-    Rays from all around say which places views see, as often as they see them; paths from there bring light: two from
-    each place, and more into cells where they differ.
+    Rays from all around say which places views see, as often as they see them, and a path from each brings light, whose
+    mean a cell takes. Views add up colours to the power of 1 / `GAMMA`, which makes them darker than the light along a
+    ray is where it or the matter's colour vary: cells are brighter by what the rays that see them lose.
 
     Args:
         matter: what scatters.
@@ -124,52 +125,64 @@ def light_grid(matter: Scattering, sky: Sky, shape: Sequence[int], cell: int) ->
     points, at = _seen(matter, grid, cell)
     if not len(points):
         return np.ones((3, *grid), np.float32)
-    total, begun, own = np.zeros((len(points), 4)), np.zeros(len(points), np.int64), _nearest(at, grid)
-    more, left = np.full(len(points), FIRST), MOST_PATHS
-    while more.any() and left > 0:
-        which = np.flatnonzero(more)
-        last = begun + more
-        total[which] += matter.gathered(sky, SEED, points[which], begun[which], last[which])[:, :4]
-        left -= int(more.sum())
-        begun = last
-        more = np.where(_uncertain(total, begun, own, math.prod(grid)), begun, 0)
-        more = np.minimum(more, left // max(int(np.count_nonzero(more)), 1))
-    light = _filtered(at, total, begun, grid)
+    one = np.ones(len(points), np.int64)
+    paths = matter.gathered(sky, SEED, points[:, :6], 0 * one, one)
+    light = _filtered(at, paths[:, :4], one, grid)
+    light *= _gain(points[:, 6], at, paths, light)
     return np.ascontiguousarray(light.transpose(3, 0, 1, 2) ** (1 / GAMMA), np.float32)
 
 
+def _gain(rays: np.ndarray, at: np.ndarray, paths: np.ndarray, light: np.ndarray) -> np.ndarray:
+    """Return by how much views show light (cz, cy, cx, 3) too dark in its cells, of the same shape.
+
+    What paths (n, 7) bring to the places of a ray is summed as light is, and what the cells hold there as views add it
+    up. The latter's mean over few places is too large as a power, by what their variance says.
+
+    Args:
+        rays: numbers (n,) of the rays that see the places.
+        at: the places' coordinates (n, 3) in the grid.
+        paths: of `Scattering.gathered`, one a place.
+        light: what the grid holds, linear.
+    """
+    from vvgt_cli.dvr.paths import GAMMA
+
+    grid = light.shape[:3]
+    _, ray, count = np.unique(rays, return_inverse=True, return_counts=True)
+    places = count[ray, None]
+
+    def along_ray(values: np.ndarray) -> np.ndarray:
+        return np.stack([np.bincount(ray, column)[ray] for column in values.T], axis=1) / places
+
+    here = sum(weight[:, None] * light[z, y, x] for (x, y, z), weight in corners(at, grid[::-1]))
+    color = (paths[:, 4:] * here) ** (1 / GAMMA)
+    shown = np.maximum(along_ray(color), FAINTEST)
+    variance = np.maximum(along_ray(color**2) / shown**2 - 1, 0) / np.maximum(places - 1, 1)
+    added = shown**GAMMA * (1 - np.minimum(GAMMA * (GAMMA - 1) / 2 * variance, 0.5))
+    lost = np.where(shown > FAINTEST, along_ray(paths[:, 4:] * paths[:, :3]) / added, 1)
+    weight = (color * added).mean(axis=1) * (count[ray] > 1) + 1e-9
+    weight /= TRIES * weight.mean()
+    return _filtered(at, np.column_stack([lost, lost.mean(axis=1) ** 2]) * weight[:, None], weight, grid)
+
+
 def _seen(matter: Scattering, grid: Sequence[int], cell: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return places (n, 6) that views see, as `paths._gather` takes them, and their coordinates (n, 3) in the grid."""
-    rng, found, cells, cast = np.random.default_rng(SEED), [np.empty((0, 6))], np.zeros(math.prod(grid), bool), 0
-    count, at = 0, [np.empty((0, 3))]
-    while cast < MOST_RAYS and count < MOST_PATHS // FIRST:
-        rays = lines(matter.voxels.values.shape, matter.step, RAYS, rng)
-        some = matter.scattered(rays, SEED + cast)[:, :6]
+    """Return places (n, 7) that views see, as of `Scattering.scattered`, and their coordinates (n, 3) in the grid."""
+    rng, found, cells, count = np.random.default_rng(SEED), [np.empty((0, 7))], np.zeros(math.prod(grid), bool), 0
+    at, cast, rays = [np.empty((0, 3))], 0, RAYS // TRIES
+    while cast < MOST_RAYS and count < MOST_PATHS:
+        some = matter.scattered(
+            np.tile(lines(matter.voxels.values.shape, matter.step, rays, rng), (TRIES, 1)), SEED + cast
+        )
+        some[:, 6] = some[:, 6] % rays + cast
         cast += RAYS
         here = ((some[:, :3] + 0.5) * matter.cell) / cell - 0.5
-        cells[_nearest(here, grid)] = True
+        x, y, z = np.clip(np.round(here).astype(np.int64), 0, np.array(grid[::-1]) - 1).T
+        cells[(z * grid[1] + y) * grid[2] + x] = True
         found.append(some)
         at.append(here)
         count += len(some)
         if count >= POINTS * np.count_nonzero(cells):
             break
     return np.concatenate(found), np.concatenate(at)
-
-
-def _nearest(at: np.ndarray, grid: Sequence[int]) -> np.ndarray:
-    """Return the numbers (n,) of the cells that coordinates (n, 3) lie in."""
-    x, y, z = np.clip(np.round(at).astype(np.int64), 0, np.array(grid[::-1]) - 1).T
-    numbers: np.ndarray = (z * grid[1] + y) * grid[2] + x
-    return numbers
-
-
-def _uncertain(total: np.ndarray, begun: np.ndarray, own: np.ndarray, cells: int) -> np.ndarray:
-    """Return which points (n,) lie in cells whose light is uncertain by more than `ERROR`."""
-    paths = np.bincount(own, begun, cells)[own]
-    mean = np.bincount(own, total[:, :3].mean(axis=1), cells)[own] / paths
-    square = np.bincount(own, total[:, 3], cells)[own] / paths
-    uncertain: np.ndarray = (square - mean**2) / np.maximum(paths - 1, 1) > (ERROR * mean) ** 2
-    return uncertain
 
 
 def _filtered(at: np.ndarray, total: np.ndarray, begun: np.ndarray, grid: Sequence[int]) -> np.ndarray:
@@ -184,20 +197,47 @@ def _filtered(at: np.ndarray, total: np.ndarray, begun: np.ndarray, grid: Sequen
         node = (z * grid[1] + y) * grid[2] + x
         for row, part in zip(sums, (*total.T, begun, begun * weight), strict=True):
             row += np.bincount(node, part * weight, size)
-    paths = np.maximum(sums[4], 1e-9)
-    mean = (sums[:3] / paths).T
-    if size <= 8:
-        whole = total[:, :3].sum(axis=0) / begun.sum()
-        out: np.ndarray = np.where((sums[4] > 0)[:, None], mean, whole)
-        return out.reshape(*grid, 3)
-    half = tuple(-(-n // 2) for n in grid)
-    coarse = _filtered((at + 0.5) / 2 - 0.5, total, begun, half)
-    z, y, x = np.indices(grid).reshape(3, -1)
-    below, places = np.zeros((size, 3)), np.stack([x, y, z], axis=1) / 2 - 0.25
-    for (i, j, k), weight in corners(places, half[::-1]):
-        below += weight[:, None] * coarse[k, j, i]
-    noise = np.maximum(sums[3] / paths - mean.mean(axis=1) ** 2, 0) * sums[5] / paths**2
-    differs = (mean.mean(axis=1) - below.mean(axis=1)) ** 2
+    return np.moveaxis(_means(sums.reshape(6, *grid)), 0, -1)
+
+
+def _means(sums: np.ndarray) -> np.ndarray:
+    """Return means (3, cz, cy, cx) of sums (6, cz, cy, cx) of paths, their squares, number and squared weights."""
+    paths = np.maximum(sums[4], 1e-30)
+    mean = sums[:3] / paths
+    if sums[0].size <= 8:
+        whole = (sums[:3].sum(axis=(1, 2, 3)) / sums[4].sum())[:, None, None, None]
+        return np.where(sums[4] > 0, mean, whole)
+    half = sums
+    for axis in (1, 2, 3):
+        half = np.concatenate([_halved(half[:5], axis, 0.75, 0.25), _halved(half[5:], axis, 0.5625, 0.0625)])
+    below = _means(half)
+    for axis in (1, 2, 3):
+        below = _doubled(below, axis, sums.shape[axis])
+    noise = np.maximum(sums[3] / paths - mean.mean(axis=0) ** 2, 0) * sums[5] / paths**2
+    differs = (mean.mean(axis=0) - below.mean(axis=0)) ** 2
     share = np.where(sums[4] > 0, differs / np.maximum(differs + 2 * noise, 1e-30), 0)
-    out = below + share[:, None] * (mean - below)
-    return out.reshape(*grid, 3)
+    return below + share * (mean - below)
+
+
+def _halved(fine: np.ndarray, axis: int, near: float, far: float) -> np.ndarray:
+    """Return sums at every second node of an axis, of those at all, by the weights of interpolation."""
+    fine = np.moveaxis(fine, axis, 0)
+    even, odd = fine[::2], fine[1::2]
+    out = near * even
+    out[: len(odd)] += near * odd
+    out[:-1] += far * even[1:]
+    out[0] += far * even[0]
+    out[1:] += far * odd[: len(out) - 1]
+    if len(odd) == len(out):
+        out[-1] += far * odd[-1]
+    return np.moveaxis(out, 0, axis)
+
+
+def _doubled(coarse: np.ndarray, axis: int, count: int) -> np.ndarray:
+    """Return values at ``count`` nodes of an axis, interpolated between every second."""
+    coarse = np.moveaxis(coarse, axis, 0)
+    edged = np.concatenate([coarse[:1], coarse, coarse[-1:]])
+    out = np.empty((2 * len(coarse), *coarse.shape[1:]))
+    out[::2] = 0.75 * coarse + 0.25 * edged[:-2]
+    out[1::2] = 0.75 * coarse + 0.25 * edged[2:]
+    return np.moveaxis(out[:count], 0, axis)
