@@ -206,7 +206,8 @@ def _means(sums: np.ndarray) -> np.ndarray:
     mean = sums[:3] / paths
     if sums[0].size <= 8:
         whole = (sums[:3].sum(axis=(1, 2, 3)) / sums[4].sum())[:, None, None, None]
-        return np.where(sums[4] > 0, mean, whole)
+        alone: np.ndarray = np.where(sums[4] > 0, mean, whole)
+        return alone
     half = sums
     for axis in (1, 2, 3):
         half = np.concatenate([_halved(half[:5], axis, 0.75, 0.25), _halved(half[5:], axis, 0.5625, 0.0625)])
@@ -216,7 +217,8 @@ def _means(sums: np.ndarray) -> np.ndarray:
     noise = np.maximum(sums[3] / paths - mean.mean(axis=0) ** 2, 0) * sums[5] / paths**2
     differs = (mean.mean(axis=0) - below.mean(axis=0)) ** 2
     share = np.where(sums[4] > 0, differs / np.maximum(differs + 2 * noise, 1e-30), 0)
-    return below + share * (mean - below)
+    below += share * (mean - below)
+    return below
 
 
 def _halved(fine: np.ndarray, axis: int, near: float, far: float) -> np.ndarray:
@@ -230,7 +232,8 @@ def _halved(fine: np.ndarray, axis: int, near: float, far: float) -> np.ndarray:
     out[1:] += far * odd[: len(out) - 1]
     if len(odd) == len(out):
         out[-1] += far * odd[-1]
-    return np.moveaxis(out, 0, axis)
+    moved: np.ndarray = np.moveaxis(out, 0, axis)
+    return moved
 
 
 def _doubled(coarse: np.ndarray, axis: int, count: int) -> np.ndarray:
@@ -240,4 +243,5 @@ def _doubled(coarse: np.ndarray, axis: int, count: int) -> np.ndarray:
     out = np.empty((2 * len(coarse), *coarse.shape[1:]))
     out[::2] = 0.75 * coarse + 0.25 * edged[:-2]
     out[1::2] = 0.75 * coarse + 0.25 * edged[2:]
-    return np.moveaxis(out[:count], 0, axis)
+    moved: np.ndarray = np.moveaxis(out[:count], 0, axis)
+    return moved
