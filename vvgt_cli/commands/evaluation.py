@@ -157,7 +157,7 @@ def shown(gaussians: Gaussians, header: PlyHeader, source: StyledVolume, request
             "the --tf, --labels or --layer of the conversion, or none of these options to score the file's own look"
         )
     light = light_of(request.light, source.lighting, source.volume.space)
-    options = replace(layout_of(header), unit_distance=source.unit_distance, light=light)
+    options = replace(layout_of(header), light=light)
     return apply_function(gaussians, header, looks_of(source), options)
 
 
