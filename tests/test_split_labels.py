@@ -13,7 +13,6 @@ from vvgt_cli.conversion import labels as split
 from vvgt_cli.conversion.labels import HiddenCells, assign_labels, hidden_cells
 from vvgt_cli.conversion.request import file_bytes
 from vvgt_cli.conversion.stages import ViewingConditions
-from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.field.field import Resident
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import Gaussians, read_ply
@@ -121,7 +120,7 @@ def test_the_surface_of_labels_is_where_a_grazing_ray_is_half_covered(monkeypatc
 
     def score() -> float:
         gaussians = initialise(source.scene(), VbmOptions(max_gaussians=1500, size=256)).gaussians
-        return score_test_views(source.scene(), gaussians, 256, RenderSettings(), perceptual=False).psnr
+        return score_test_views(source.scene(), gaussians, 256).psnr
 
     ours = score()
     monkeypatch.setattr(surface_offset, "LABEL_DEPTH", surface_offset.OPAQUE_DEPTH)

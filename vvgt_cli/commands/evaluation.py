@@ -232,7 +232,7 @@ def _scored(
     views, record = len(default_views("test")), volume_record(volume.source)
     evaluation = Evaluation(len(carried), size, rule.name, step, views, record, function, own)
     settings = replace(REFERENCE, step=step)
-    wanted = [Picture(camera, settings, part) for _, camera, part in scored_views(size, perceptual=True)]
+    wanted = [Picture(camera, settings, part) for _, camera, part in scored_views(size)]
     with run.stage("test views") as stage, _together(volume, wanted):
         bar = run.console.bar("test views")
         scores = score_test_views(volume.views, gaussians, size, settings, rule=rule, progress=bar)

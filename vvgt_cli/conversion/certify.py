@@ -151,12 +151,7 @@ def verify(
         looked_up: the Gaussians of a live file are as `vvgt recolor` shows them, not as stored.
         values: dB of a live file's values on the volume's grid (`rounded_error`).
     """
-    from vvgt_cli.dvr import RenderSettings
-
-    scores = score_test_views(
-        field.views, gaussians, certificate.size, RenderSettings(), rule=certificate.rule, perceptual=False,
-        only=PREVIEW_VIEWS,
-    )  # fmt: skip
+    scores = score_test_views(field.views, gaussians, certificate.size, rule=certificate.rule, every=False)
     digests = certificate.sha256, None if certificate.sha256 is None else field.digest
     same = None if None in digests else digests[0] == digests[1]
     recorded = certificate.live_psnr if looked_up and certificate.live_psnr is not None else certificate.psnr
