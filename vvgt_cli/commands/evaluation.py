@@ -277,10 +277,7 @@ def _reference_psnr(volume: Field, size: int, step: float) -> float:
     from vvgt_cli.dvr import REFERENCE, render_view
     from vvgt_cli.images.metrics import score_view
 
-    whole = default_views("test", size=size)[0]
-    edge = min(size // 2, MIDDLE)
-    offset = (size - edge) // 2
-    middle = replace(whole, cx=whole.cx - offset, cy=whole.cy - offset, width=edge, height=edge)
+    middle = default_views("test", size=size)[0].middle(min(size // 2, MIDDLE))
     settings = replace(REFERENCE, step=step)
     finer = replace(settings, step=settings.step / 2, tiers=tuple((edge, 4 * rays) for edge, rays in settings.tiers))
     with _together(volume, [Picture(middle, finer), Picture(middle, settings)]):
