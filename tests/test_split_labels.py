@@ -10,7 +10,8 @@ from tests.processes import VVGT, python
 from vvgt_cli.closed_form import VbmOptions
 from vvgt_cli.closed_form.tree import HIDDEN
 from vvgt_cli.conversion import labels as split
-from vvgt_cli.conversion.labels import HiddenCells, assign_labels, hidden_cells
+from vvgt_cli.conversion.changes import around
+from vvgt_cli.conversion.labels import HiddenCells, assign_labels
 from vvgt_cli.conversion.request import file_bytes
 from vvgt_cli.conversion.stages import ViewingConditions
 from vvgt_cli.field.field import Resident
@@ -161,7 +162,8 @@ def test_gaussians_near_no_label_are_told_by_colours_that_light_darkens() -> Non
 
 def hidden_of(source):
     form = Resident(source).pyramid(VbmOptions(600, 64)).form
-    return hidden_cells(form.seen.largest > HIDDEN, form.seen.edge, form.half, form.step)
+    unseen = ~around(form.seen.largest > HIDDEN, np.maximum)
+    return HiddenCells(unseen, form.seen.edge, form.half, form.step)
 
 
 @pytest.mark.parametrize("cut", [False, True])
