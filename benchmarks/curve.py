@@ -112,7 +112,7 @@ def score(paths: tuple[str, ...], folder: str, output: str) -> None:
         for file in sorted(files, key=lambda file: file.suffixes[-3]):
             made, _ = read_ply(file)
             views = [
-                score_drawn_view(there, render(made, camera, INRIA, blocks=part), part, whole=False, perceptual=False)
+                score_drawn_view(there, render(made, camera, INRIA, blocks=part), part, whole=False)
                 for camera, part, there in seen
             ]
             label, steps = (suffix[1:] for suffix in file.suffixes[-3:-1])

@@ -67,30 +67,27 @@ def score_test_views(
     for done, (i, camera, drawn) in enumerate(wanted):
         reference, ours = render_view(scene, camera, settings, drawn), render(gaussians, camera, rule, blocks=drawn)
         blocks = spread_blocks(camera.width, camera.height, i)
-        views.append(score_drawn_view(reference, ours, blocks, drawn is None, every))
+        views.append(score_drawn_view(reference, ours, blocks, every and drawn is None))
         if progress:
             progress(done + 1, len(wanted))
     return mean_scores(views)
 
 
-def score_drawn_view(
-    reference: np.ndarray, ours: np.ndarray, blocks: Blocks | None, whole: bool = True, perceptual: bool = True
-) -> ViewScore:
-    """Score one view: errors of its blocks, if any; SSIM and FLIP of the whole, where it was drawn.
+def score_drawn_view(reference: np.ndarray, ours: np.ndarray, blocks: Blocks | None, whole: bool = True) -> ViewScore:
+    """Score one view: errors of its blocks, if any; SSIM and FLIP of the whole, where that was drawn for them.
 
     Args:
         reference: (h, w, 4) float32 premultiplied picture of the volume.
         ours: the same of the Gaussians.
         blocks: blocks of the view, or None for all of it.
-        whole: whether the whole view was drawn.
-        perceptual: SSIM and FLIP too.
+        whole: whether the whole view was drawn, for SSIM and FLIP too.
     """
     from vvgt_cli.images.metrics import score_view
 
     if blocks is None:
-        return score_view(reference, ours, perceptual=perceptual)
+        return score_view(reference, ours, perceptual=whole)
     score = score_view(blocks.pick(reference), blocks.pick(ours), perceptual=False)
-    if perceptual and whole:
+    if whole:
         seen = score_view(reference, ours)
         score = replace(score, ssim=seen.ssim, flip=seen.flip)
     return score
