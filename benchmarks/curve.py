@@ -94,26 +94,25 @@ def measure(
 @click.option("-o", "--output", required=True)
 def score(paths: tuple[str, ...], folder: str, output: str) -> None:
     """The CSV of all that was measured."""
+    from vvgt_cli.cameras import default_views, spread_blocks
     from vvgt_cli.dvr import RenderSettings, render_view
     from vvgt_cli.gaussians import read_ply
     from vvgt_cli.gaussians.rules import INRIA
     from vvgt_cli.images.metrics import mean_scores
-    from vvgt_cli.score.views import score_drawn_view, scored_views
+    from vvgt_cli.score.views import score_drawn_view
     from vvgt_cli.splat import render
 
     fine = RenderSettings(step=1 / 8)
     rows: list[dict[str, Any]] = []
+    parts = [(camera, spread_blocks(SIZE, SIZE, i)) for i, camera in enumerate(default_views("test", size=SIZE))]
     for name, source in read_scenes(paths[0], paths[1], paths[2]):
         scene = source.scene()
-        seen = [
-            (camera, part, render_view(scene, camera, fine, part))
-            for _, camera, part in scored_views(SIZE, perceptual=False)
-        ]
+        seen = [(camera, part, render_view(scene, camera, fine, part)) for camera, part in parts]
         files = sorted(Path(folder).glob(f"{name}.*.ply"), key=lambda file: int(file.suffixes[-2][1:]))
         for file in sorted(files, key=lambda file: file.suffixes[-3]):
             made, _ = read_ply(file)
             views = [
-                score_drawn_view(there, render(made, camera, INRIA, blocks=part), part, whole=False, perceptual=False)
+                score_drawn_view(there, render(made, camera, INRIA, blocks=part), part, whole=False)
                 for camera, part, there in seen
             ]
             label, steps = (suffix[1:] for suffix in file.suffixes[-3:-1])

@@ -26,7 +26,6 @@ from vvgt_cli.conversion.recolored import visible_cloud
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import ClosedFormStage
-from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.field.field import Resident
 from vvgt_cli.field.layered import OpenedFile
 from vvgt_cli.field.source import SourceRequest
@@ -37,7 +36,6 @@ from vvgt_cli.look.histogram import background_bins
 from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
-from vvgt_cli.score.viewing import PREVIEW_VIEWS
 from vvgt_cli.score.views import score_test_views
 from vvgt_cli.volume import Statistics
 
@@ -90,7 +88,7 @@ def placed(field: Resident, gaussians: int) -> Gaussians:
 
 def score(field: Resident, gaussians: Gaussians) -> float:
     """dB on three test views."""
-    return score_test_views(field.views, gaussians, SIZE, RenderSettings(), perceptual=False, only=PREVIEW_VIEWS).psnr
+    return score_test_views(field.views, gaussians, SIZE, every=False).psnr
 
 
 def measured_lit(name: str, field: Resident, gaussians: int) -> list[dict[str, Any]]:

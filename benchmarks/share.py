@@ -19,13 +19,12 @@ from dvr_scenes import print_table, read_scenes, write_rows
 from vvgt_cli.cameras import default_views
 from vvgt_cli.conversion.gaussian_files import file_rule, layout_of, open_gaussians
 from vvgt_cli.conversion.place import preview, to_box_frame, upright_axes
-from vvgt_cli.dvr import RenderSettings, Scene
+from vvgt_cli.dvr import Scene
 from vvgt_cli.errors import DataError
 from vvgt_cli.field.source import StyledVolume
 from vvgt_cli.gaussians import Gaussians, in_unit_frame
 from vvgt_cli.gaussians.formats import FORMATS, encoded, read_splats
 from vvgt_cli.gaussians.rules import Rule
-from vvgt_cli.score.viewing import PREVIEW_VIEWS
 from vvgt_cli.score.views import score_test_views
 
 PICTURED, EDGE, QUALITY = 4, 360, 88  # test view from the side, pixels of a picture, of JPEG
@@ -34,8 +33,7 @@ PICTURED, EDGE, QUALITY = 4, 360, 88  # test view from the side, pixels of a pic
 def score(source: StyledVolume, scene: Scene, gaussians: Gaussians, size: int, rule: Rule) -> float:
     """PSNR on three test views, dB."""
     inside = to_box_frame(gaussians, source.volume)
-    settings = RenderSettings()
-    return score_test_views(scene, inside, size, settings, rule=rule, perceptual=False, only=PREVIEW_VIEWS).psnr
+    return score_test_views(scene, inside, size, rule=rule, every=False).psnr
 
 
 def rows(name: str, source: StyledVolume, scene: Scene, path: Path) -> Iterator[dict[str, Any]]:

@@ -21,7 +21,7 @@ FINE = RenderSettings(step=0.125, samples=1)
 
 
 class Function:
-    """Linear opacity and colour between nodes; conforms to `TransferFunctionLike`."""
+    """Linear opacity and colour between nodes; has what the renderers use of a `TransferFunction`."""
 
     name = "test"
 

@@ -10,10 +10,10 @@ from tests.processes import VVGT, python
 from vvgt_cli.closed_form import VbmOptions
 from vvgt_cli.closed_form.tree import HIDDEN
 from vvgt_cli.conversion import labels as split
-from vvgt_cli.conversion.labels import HiddenCells, assign_labels, hidden_cells
+from vvgt_cli.conversion.changes import around
+from vvgt_cli.conversion.labels import HiddenCells, assign_labels
 from vvgt_cli.conversion.request import file_bytes
 from vvgt_cli.conversion.stages import ViewingConditions
-from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.field.field import Resident
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import Gaussians, read_ply
@@ -121,7 +121,7 @@ def test_the_surface_of_labels_is_where_a_grazing_ray_is_half_covered(monkeypatc
 
     def score() -> float:
         gaussians = initialise(source.scene(), VbmOptions(max_gaussians=1500, size=256)).gaussians
-        return score_test_views(source.scene(), gaussians, 256, RenderSettings(), perceptual=False).psnr
+        return score_test_views(source.scene(), gaussians, 256).psnr
 
     ours = score()
     monkeypatch.setattr(surface_offset, "LABEL_DEPTH", surface_offset.OPAQUE_DEPTH)
@@ -162,7 +162,8 @@ def test_gaussians_near_no_label_are_told_by_colours_that_light_darkens() -> Non
 
 def hidden_of(source):
     form = Resident(source).pyramid(VbmOptions(600, 64)).form
-    return hidden_cells(form.seen.largest > HIDDEN, form.seen.edge, form.half, form.step)
+    unseen = ~around(form.seen.largest > HIDDEN, np.maximum)
+    return HiddenCells(unseen, form.seen.edge, form.half, form.step)
 
 
 @pytest.mark.parametrize("cut", [False, True])

@@ -20,30 +20,42 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 __version__ = VERSION
 
 if TYPE_CHECKING:
-    from vvgt_cli.cameras import Camera, default_views, orbit_views
-    from vvgt_cli.commands.check import check
-    from vvgt_cli.commands.convert import convert
-    from vvgt_cli.commands.evaluate import evaluate
-    from vvgt_cli.commands.infer import infer
-    from vvgt_cli.commands.info import info
-    from vvgt_cli.commands.init import init
-    from vvgt_cli.commands.optimize import optimize
-    from vvgt_cli.commands.recolor import recolor
-    from vvgt_cli.commands.render import render
-    from vvgt_cli.commands.render_views import render_views
-    from vvgt_cli.commands.report import report
-    from vvgt_cli.commands.session import Session, read_ply, read_volume
-    from vvgt_cli.commands.synth import synth
-    from vvgt_cli.commands.view import view
-    from vvgt_cli.commands.voxelize import voxelize
-    from vvgt_cli.conversion.clouds import Clouds
-    from vvgt_cli.conversion.result import Conversion, Result
-    from vvgt_cli.errors import DataError, UsageError, VvgtError
-    from vvgt_cli.gaussians import Gaussians, PlyHeader
-    from vvgt_cli.integrations.pyvista import export_plotter
-    from vvgt_cli.library.inputs import Look
-    from vvgt_cli.look import ColorMap, LightOptions, PiecewiseOpacity, TransferFunction, read_transfer_function
-    from vvgt_cli.volume import Volume
+    from vvgt_cli.cameras import Camera as Camera
+    from vvgt_cli.cameras import default_views as default_views
+    from vvgt_cli.cameras import orbit_views as orbit_views
+    from vvgt_cli.commands.check import check as check
+    from vvgt_cli.commands.convert import convert as convert
+    from vvgt_cli.commands.evaluate import evaluate as evaluate
+    from vvgt_cli.commands.infer import infer as infer
+    from vvgt_cli.commands.info import info as info
+    from vvgt_cli.commands.init import init as init
+    from vvgt_cli.commands.optimize import optimize as optimize
+    from vvgt_cli.commands.recolor import recolor as recolor
+    from vvgt_cli.commands.render import render as render
+    from vvgt_cli.commands.render_views import render_views as render_views
+    from vvgt_cli.commands.report import report as report
+    from vvgt_cli.commands.session import Session as Session
+    from vvgt_cli.commands.session import read_ply as read_ply
+    from vvgt_cli.commands.session import read_volume as read_volume
+    from vvgt_cli.commands.synth import synth as synth
+    from vvgt_cli.commands.view import view as view
+    from vvgt_cli.commands.voxelize import voxelize as voxelize
+    from vvgt_cli.conversion.clouds import Clouds as Clouds
+    from vvgt_cli.conversion.result import Conversion as Conversion
+    from vvgt_cli.conversion.result import Result as Result
+    from vvgt_cli.errors import DataError as DataError
+    from vvgt_cli.errors import UsageError as UsageError
+    from vvgt_cli.errors import VvgtError as VvgtError
+    from vvgt_cli.gaussians import Gaussians as Gaussians
+    from vvgt_cli.gaussians import PlyHeader as PlyHeader
+    from vvgt_cli.integrations.pyvista import export_plotter as export_plotter
+    from vvgt_cli.library.inputs import Look as Look
+    from vvgt_cli.look import ColorMap as ColorMap
+    from vvgt_cli.look import LightOptions as LightOptions
+    from vvgt_cli.look import PiecewiseOpacity as PiecewiseOpacity
+    from vvgt_cli.look import TransferFunction as TransferFunction
+    from vvgt_cli.look import read_transfer_function as read_transfer_function
+    from vvgt_cli.volume import Volume as Volume
 
 _WHERE = {  # imported on first use, so that `import vvgt_cli` costs nothing
     "cameras": ("Camera", "default_views", "orbit_views"),
@@ -65,44 +77,7 @@ _WHERE = {  # imported on first use, so that `import vvgt_cli` costs nothing
 }
 _MODULES = {name: module for module, names in _WHERE.items() for name in names}
 
-__all__ = [
-    "Camera",
-    "Clouds",
-    "ColorMap",
-    "Conversion",
-    "DataError",
-    "Gaussians",
-    "LightOptions",
-    "Look",
-    "PiecewiseOpacity",
-    "PlyHeader",
-    "Result",
-    "Session",
-    "TransferFunction",
-    "UsageError",
-    "Volume",
-    "VvgtError",
-    "check",
-    "convert",
-    "default_views",
-    "evaluate",
-    "export_plotter",
-    "infer",
-    "info",
-    "init",
-    "optimize",
-    "orbit_views",
-    "read_ply",
-    "read_transfer_function",
-    "read_volume",
-    "recolor",
-    "render",
-    "render_views",
-    "report",
-    "synth",
-    "view",
-    "voxelize",
-]
+__all__ = sorted(_MODULES)
 
 
 def __getattr__(name: str) -> Any:

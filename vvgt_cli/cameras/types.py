@@ -54,6 +54,11 @@ class Camera:
         result: np.ndarray = -self.rotation.T @ self.translation
         return result
 
+    def middle(self, edge: int) -> Camera:
+        """Return the middle of the picture of the same view, ``edge`` pixels wide and high."""
+        x, y = (self.width - edge) // 2, (self.height - edge) // 2
+        return replace(self, cx=self.cx - x, cy=self.cy - y, width=edge, height=edge)
+
     def resized(self, factor: float) -> Camera:
         """Return the same view with ``factor`` times the pixels along each axis."""
         return replace(

@@ -106,7 +106,7 @@ def _against(field: Field, unit: Gaussians, header: PlyHeader, size: int, tolera
 
     @cache
     def scores() -> Any:
-        return score_test_views(field.views, gaussians, size, settings, rule=rule, perceptual=False, only=PREVIEW_VIEWS)
+        return score_test_views(field.views, gaussians, size, settings, rule=rule, every=False)
 
     @cache
     def conditions() -> Any:

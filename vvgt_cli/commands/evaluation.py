@@ -157,7 +157,7 @@ def shown(gaussians: Gaussians, header: PlyHeader, source: StyledVolume, request
             "the --tf, --labels or --layer of the conversion, or none of these options to score the file's own look"
         )
     light = light_of(request.light, source.lighting, source.volume.space)
-    options = replace(layout_of(header), unit_distance=source.unit_distance, light=light)
+    options = replace(layout_of(header), light=light)
     return apply_function(gaussians, header, looks_of(source), options)
 
 
@@ -232,7 +232,7 @@ def _scored(
     views, record = len(default_views("test")), volume_record(volume.source)
     evaluation = Evaluation(len(carried), size, rule.name, step, views, record, function, own)
     settings = replace(REFERENCE, step=step)
-    wanted = [Picture(camera, settings, part) for _, camera, part in scored_views(size, perceptual=True)]
+    wanted = [Picture(camera, settings, part) for _, camera, part in scored_views(size)]
     with run.stage("test views") as stage, _together(volume, wanted):
         bar = run.console.bar("test views")
         scores = score_test_views(volume.views, gaussians, size, settings, rule=rule, progress=bar)
@@ -277,10 +277,7 @@ def _reference_psnr(volume: Field, size: int, step: float) -> float:
     from vvgt_cli.dvr import REFERENCE, render_view
     from vvgt_cli.images.metrics import score_view
 
-    whole = default_views("test", size=size)[0]
-    edge = min(size // 2, MIDDLE)
-    offset = (size - edge) // 2
-    middle = replace(whole, cx=whole.cx - offset, cy=whole.cy - offset, width=edge, height=edge)
+    middle = default_views("test", size=size)[0].middle(min(size // 2, MIDDLE))
     settings = replace(REFERENCE, step=step)
     finer = replace(settings, step=settings.step / 2, tiers=tuple((edge, 4 * rays) for edge, rays in settings.tiers))
     with _together(volume, [Picture(middle, finer), Picture(middle, settings)]):

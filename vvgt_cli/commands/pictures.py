@@ -378,10 +378,7 @@ def _greatest(source: StyledVolume, parts: Iterable[Part], camera: Camera) -> np
     from vvgt_cli.dvr.render import BoxFrame, camera_arrays
 
     n, frame, dims = MIP_RAYS, source.volume.unit_frame(), np.array(source.volume.dims)
-    larger = replace(
-        camera, fx=n * camera.fx, fy=n * camera.fy, cx=n * camera.cx, cy=n * camera.cy,
-        width=n * camera.width, height=n * camera.height,
-    )  # fmt: skip
+    larger = camera.resized(n)
     rays = camera_arrays(BoxFrame(np.array(frame.half), np.array(frame.step)), larger)
     out = np.zeros((larger.height, larger.width), np.float32)
     for box, lo, hi in parts:

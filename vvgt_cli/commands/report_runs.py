@@ -54,7 +54,7 @@ from vvgt_cli.score.curves import (
 from vvgt_cli.score.page import Pictures, page
 from vvgt_cli.score.record import ConversionReport, Run, document
 from vvgt_cli.score.viewing import SIDE, ConditionView, condition_pictures, condition_views, score_conditions, screens
-from vvgt_cli.score.views import WHOLE, Views, render_check_views, score_test_views, scored_views
+from vvgt_cli.score.views import Views, render_check_views, score_test_views, scored_views
 from vvgt_cli.volume.blocks import check_memory
 
 SHARES = (64, 16, 4)  # of the budget, for the closed form at several K
@@ -135,7 +135,7 @@ class Reference:
         from vvgt_cli.dvr import REFERENCE
 
         views, around = RememberedViews(size, volume.views), condition_pictures(screens(size), SIDE)
-        scored = [Picture(camera, REFERENCE, blocks) for _, camera, blocks in scored_views(size, perceptual=True)]
+        scored = [Picture(camera, REFERENCE, blocks) for _, camera, blocks in scored_views(size)]
         volume.views.expect([*scored, *(Picture(camera, REFERENCE, part) for _, camera, part in around)])
         bar = console.bar("reference")
         for done, picture in enumerate(scored, 1):
@@ -154,7 +154,7 @@ class Reference:
 
         if not isinstance(field, Resident):
             return None
-        cameras = [default_views("test", size=self.size)[n] for n in WHOLE]
+        cameras = [camera for _, camera, _ in scored_views(self.size, every=False)]
         try:
             with quiet_vtk():  # which says where it looked for a screen
                 draw = view_renderer(field.scene)

@@ -40,7 +40,7 @@ def with_certificate(
     scores, conditions = run.report.scores, [ViewingCondition(**condition) for condition in run.report.conditions or ()]
     if not ply.comments or scores is None:
         return ply
-    values = rounded_error(ply, gaussians, field)
+    values, texture = rounded_error(ply, gaussians, field), run.report.texture or {"ours": None}
     found = Certificate(
         volume=ply.title or field.source.title,
         sha256=field.digest,
@@ -52,7 +52,7 @@ def with_certificate(
         pixels=test_view_pixels(fit.screen),
         live_psnr=None if live_psnr is None else round(live_psnr, 2),
         conditions=tuple((condition.name(), round(condition.psnr, 2)) for condition in conditions),
-        texture=_rounded_texture(run.report.texture),
+        texture=None if texture["ours"] is None else (round(texture["ours"], 3), round(texture["reference"], 3)),
         position_error=position_error(gaussians, ply),
         values_psnr=values[0],
         values_error=values[1],
@@ -68,12 +68,6 @@ def rounded_error(ply: FileFacts, gaussians: Gaussians, field: Field) -> tuple[f
         return None, None
     psnr, largest = values_error(ply, gaussians, volume) or (None, None)
     return psnr and round(psnr, 2), largest and float(f"{largest:.4g}")
-
-
-def _rounded_texture(found: dict[str, Any] | None) -> tuple[float, float] | None:
-    if found is None or found["ours"] is None:
-        return None
-    return round(found["ours"], 3), round(found["reference"], 3)
 
 
 def preview_psnr(scores: dict[str, Any]) -> float:
@@ -151,12 +145,7 @@ def verify(
         looked_up: the Gaussians of a live file are as `vvgt recolor` shows them, not as stored.
         values: dB of a live file's values on the volume's grid (`rounded_error`).
     """
-    from vvgt_cli.dvr import RenderSettings
-
-    scores = score_test_views(
-        field.views, gaussians, certificate.size, RenderSettings(), rule=certificate.rule, perceptual=False,
-        only=PREVIEW_VIEWS,
-    )  # fmt: skip
+    scores = score_test_views(field.views, gaussians, certificate.size, rule=certificate.rule, every=False)
     digests = certificate.sha256, None if certificate.sha256 is None else field.digest
     same = None if None in digests else digests[0] == digests[1]
     recorded = certificate.live_psnr if looked_up and certificate.live_psnr is not None else certificate.psnr

@@ -10,16 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vvgt_cli.conversion.index import (
-    FRAMES,
-    entry,
-    index_output,
-    is_pattern,
-    psnr_of,
-    put_name,
-    shown_name,
-    write_index,
-)
+from vvgt_cli.conversion.index import FRAMES, entry, index_output, is_pattern, put_name, shown_name, write_index
 from vvgt_cli.conversion.result import Result
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
@@ -147,8 +138,8 @@ class Clouds(Mapping[str, Result]):
         rows, total, folder = [], 0, Path(index.path).parent
         for cloud, file in zip(self.clouds, files, strict=True):
             size = cloud.save(file, overwrite=overwrite, **how)
-            row = entry(cloud.name, len(cloud.gaussians), size, psnr_of(cloud.report), **cloud.facts)
-            rows.append({**row, "file": Path(os.path.relpath(file, folder)).as_posix()})
+            beside = Path(os.path.relpath(file, folder)).as_posix()
+            rows.append(entry(cloud.name, len(cloud.gaussians), size, cloud.report, cloud.facts, beside))
             total += size
         write_index(index.path, self.kind, self.volume, rows, self.facts, overwrite)
         return total

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 
 from vvgt_cli.conversion.certify import with_certificate
@@ -56,9 +56,13 @@ def convert_one(
     check_request(request)
     run = Run(console or Console(), ConversionReport("convert" if request.scored else "init"))
     with ExitStack() as stack:
-        stack.enter_context(outputs_of(request, run))
+        stack.enter_context(folder_of(request.output))
+        stack.enter_context(claimed(request.outputs(), request.inputs(), request.overwrite))
+        stack.enter_context(checkpoint_folder(request.checkpoint))
         field = stack.enter_context(open_field(run, request))
         conversion = convert_field(run, request, field, start, finished, unscored)
+        if request.checkpoint is not None and not run.report.interrupted:
+            Checkpoint(Path(request.checkpoint)).finish()
         if request.output is None:
             run.finish()
             weakref.finalize(conversion, stack.pop_all().close)
@@ -94,23 +98,6 @@ def convert_field(
             write(run, request, work, conversion, again=early)
         write_beside(run, request, conversion)
     return conversion
-
-
-@contextmanager
-def outputs_of(request: ConvertRequest, run: Run) -> Iterator[None]:
-    """Claim the outputs of a request and its checkpoints, which are removed once the output is complete.
-
-    Raises:
-        UsageError: an output may not be written; raised before anything is read.
-    """
-    with (
-        folder_of(request.output),
-        claimed(request.outputs(), request.inputs(), request.overwrite),
-        checkpoint_folder(request.checkpoint),
-    ):
-        yield
-        if request.checkpoint is not None and not run.report.interrupted:
-            Checkpoint(Path(request.checkpoint)).finish()
 
 
 def write(

@@ -28,17 +28,7 @@ from vvgt_cli.conversion.clouds import Cloud, Clouds, write_together
 from vvgt_cli.conversion.convert import convert_one
 from vvgt_cli.conversion.fitting import plan_of
 from vvgt_cli.conversion.frames import FrameSeries, is_glob_of_volumes
-from vvgt_cli.conversion.index import (
-    FRAMES,
-    FUNCTIONS,
-    LABELS,
-    entry,
-    index_output,
-    is_pattern,
-    psnr_of,
-    put_name,
-    write_index,
-)
+from vvgt_cli.conversion.index import FRAMES, FUNCTIONS, LABELS, entry, index_output, is_pattern, put_name, write_index
 from vvgt_cli.conversion.labels import Labels
 from vvgt_cli.conversion.manifest import Manifest, Shard, parse_shard
 from vvgt_cli.conversion.merge import write_shard
@@ -160,9 +150,7 @@ class Files:
     def take(self, batch: Batch, item: Item, report: ConversionReport, facts: Mapping[str, Any]) -> None:
         """Record a complete item."""
         names = [self._key(name) for name in self.names(batch, item.stem).values()]
-        row = entry(item.name, report.gaussians, report.bytes, psnr_of(report), **facts)
-        row["file"] = names[0]
-        self._rows[item.stem] = row
+        row = self._rows[item.stem] = entry(item.name, report.gaussians, report.bytes, report, facts, names[0])
         if self._manifest is not None:
             self._manifest.record(names, {names[0]: {"row": row}})
 

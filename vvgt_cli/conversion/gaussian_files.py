@@ -215,7 +215,6 @@ def read_back(
         options: layout of the file.
         field: their volume; the loss of PSNR against its pictures is reported instead.
     """
-    from vvgt_cli.dvr import RenderSettings
     from vvgt_cli.images.metrics import psnr
     from vvgt_cli.splat import render
 
@@ -227,11 +226,10 @@ def read_back(
         if field is not None:
             before, after = (
                 score_test_views(
-                    field.views, to_box_frame(cloud, field.source.volume), size, RenderSettings(), rule=rule,
-                    perceptual=False, only=PREVIEW_VIEWS,
+                    field.views, to_box_frame(cloud, field.source.volume), size, rule=rule, every=False
                 ).psnr
                 for cloud in clouds
-            )  # fmt: skip
+            )
             stage.note = (
                 f"PSNR {after:.2f} dB, a .ply would have {before:.2f}: the format costs {before - after:.2f} dB"
             )

@@ -114,15 +114,12 @@ def index_output(pattern: str) -> Output:
     return Output("-o", index_path(pattern), (".json",), binary=False)
 
 
-def entry(name: str, gaussians: int | None, size: int, psnr: float | None, **facts: Any) -> dict[str, Any]:
-    """Return the row of a cloud in an index, without its file."""
-    scored = {} if psnr is None else {"psnr": psnr}
-    return {"name": name, "gaussians": gaussians, "bytes": size, **scored, **facts}
-
-
-def psnr_of(report: ConversionReport) -> float | None:
-    """Return the mean PSNR (dB) over the test views; None where none were drawn."""
-    return None if report.scores is None else report.scores["psnr"]
+def entry(
+    name: str, gaussians: int | None, size: int, report: ConversionReport, facts: Mapping[str, Any], file: str
+) -> dict[str, Any]:
+    """Return the row of a cloud in an index, with its mean PSNR (dB) over the test views where some were drawn."""
+    scored = {} if report.scores is None else {"psnr": report.scores["psnr"]}
+    return {"name": name, "gaussians": gaussians, "bytes": size, **scored, **facts, "file": file}
 
 
 def write_index(

@@ -191,7 +191,8 @@ def _gaussians(request: ConvertRequest, parts: Sequence[Part], run: Run) -> list
         assert form is not None
         from vvgt_cli.closed_form.tree import HIDDEN
 
-        hides = hidden_cells(form.seen.largest > HIDDEN, form.seen.edge, form.half, form.step)
+        unseen = ~around(form.seen.largest > HIDDEN, np.maximum)
+        hides = HiddenCells(unseen, form.seen.edge, form.half, form.step)
     hidden: list[list[Gaussians]] = []
     for part, (volume, _, label) in zip(parts, labels, strict=True):
         hidden.append([])
@@ -289,18 +290,6 @@ class HiddenCells:
         n = self.cells.shape[2 - axis]
         cells: np.ndarray = np.clip(np.floor(voxels / self.edge[axis]), 0, n - 1).astype(np.int64)
         return cells
-
-
-def hidden_cells(near: np.ndarray, edge: np.ndarray, half: np.ndarray, step: np.ndarray) -> HiddenCells:
-    """Return the cells that no training view sees.
-
-    Args:
-        near: (nz, ny, nx) bool, the cells that some view sees.
-        edge: see `HiddenCells`.
-        half: see `HiddenCells`.
-        step: see `HiddenCells`.
-    """
-    return HiddenCells(~around(near, np.maximum), edge, half, step)
 
 
 def assign_labels(gaussians: Gaussians, shown: Sequence[tuple[Volume, LabelTable, Label]]) -> np.ndarray:

@@ -37,7 +37,6 @@ from vvgt_cli.look.lighting import Lighting, is_sky
 from vvgt_cli.look.recognise import background_bins
 from vvgt_cli.look.tables import extinction
 from vvgt_cli.score.record import Run
-from vvgt_cli.score.viewing import PREVIEW_VIEWS
 from vvgt_cli.score.views import psnr_note, score_test_views
 from vvgt_cli.volume.label_maps import extents_of
 from vvgt_cli.volume.stats import Statistics
@@ -119,30 +118,20 @@ class LiveLook(Stage):
 
     def run(self, work: Work) -> None:
         """Score the Gaussians."""
-        from vvgt_cli.dvr import RenderSettings
-
         fit, source = work.fit, work.field.source
         assert work.ply.live is not None
         table, lighting = _baked_look(source, work.ply.live), box_lighting(source)
         shown = visible_cloud(work.current(), table, lighting, pixel_width(fit.screen))
         name = source.look_name
         with work.run.stage(self.name) as stage:
-            live = score_test_views(
-                work.field.views,
-                shown,
-                fit.screen,
-                RenderSettings(),
-                rule=fit.rule,
-                perceptual=False,
-                only=PREVIEW_VIEWS,
-            )
+            live = score_test_views(work.field.views, shown, fit.screen, rule=fit.rule, every=False)
             stage.note = f"{psnr_note(live)} under {name} as 'vvgt recolor' shows it; scoring next as others show it"
         work.live_psnr = live.psnr
 
 
 def _baked_look(source: StyledVolume, facts: LiveFacts) -> Looks:
     """Return the lookup table of a source's functions, for live Gaussians with these facts."""
-    return lookup_table(facts, looks_of(source), source.unit_distance, source.volume.unit_frame().scale)
+    return lookup_table(facts, looks_of(source), source.volume.unit_frame().scale)
 
 
 def _one_layer(run: Run, fit: FitOptions, field: Field) -> Gaussians:

@@ -182,12 +182,6 @@ def closed_form_parts(run: Run, run_pass: Pass, cut: Cut) -> FinishedParts:
     return FinishedParts(cut, threshold, stored, cut.over_tiles(threshold), removed)
 
 
-def refined_parts(run: Run, run_pass: Pass, parts: FinishedParts, refiner: Refiner) -> FinishedParts:
-    """Return the same cut with refined Gaussians; raise DataError for damaged blocks."""
-    thresholds = parts.cut.everywhere(parts.threshold)
-    return replace(parts, stored=make_parts(run, run_pass, parts.cut, thresholds, refiner, least=False))
-
-
 def choose_levels(run: Run, run_pass: Pass, cut: Cut, refiner: Callable[[], Refiner | None] = lambda: None) -> Levels:
     """Choose levels by measured errors, and make them; results of an interrupted run are reused.
 

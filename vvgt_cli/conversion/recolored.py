@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -20,39 +20,25 @@ from vvgt_cli.look.resolve import unit_of_values
 from vvgt_cli.look.tables import exposed_distance
 from vvgt_cli.volume import Volume
 
-
-@dataclass(frozen=True)
-class SeveralLooks:
-    """The function or label table of each of several layers, with its opacity unit distance (world length)."""
-
-    looks: tuple[tuple[TransferFunction | LabelTable, float], ...]
-
-    @property
-    def name(self) -> str:
-        """Return the names of all layers' functions, joined."""
-        return " + ".join(tf.name for tf, _ in self.looks)
+# function or label table of each layer, with its opacity unit distance (world length)
+LayerLooks = Sequence[tuple[TransferFunction | LabelTable, float]]
 
 
-Look = TransferFunction | LabelTable | SeveralLooks
-
-
-def looks_of(source: StyledVolume) -> Look:
-    """Return the look of a source: of one layer its function or label table, else those of all layers."""
-    if len(source.layers) == 1:
-        return source.tf
-    return SeveralLooks(tuple((layer.tf, layer.unit_distance) for layer in source.layers))
+def looks_of(source: StyledVolume) -> LayerLooks:
+    """Return the looks of a source."""
+    return [(layer.tf, layer.unit_distance) for layer in source.layers]
 
 
 def apply_function(
-    gaussians: Gaussians, facts: FileFacts, tf: Look, options: PlyOptions, empty: bool = False
+    gaussians: Gaussians, facts: FileFacts, looks: LayerLooks, options: PlyOptions, empty: bool = False
 ) -> Gaussians:
-    """Return live Gaussians under a function on data values (or labels under a table) and a light, unit frame.
+    """Return live Gaussians under functions on data values (or labels under a table) and a light, unit frame.
 
     Args:
         gaussians: live Gaussians, unit frame.
         facts: header of their file.
-        tf: the look.
-        options: unit distance, light and screen size of the result.
+        looks: of its layers.
+        options: light and screen size of the result.
         empty: the result may be empty.
 
     Raises:
@@ -60,33 +46,28 @@ def apply_function(
     """
     assert facts.live is not None
     assert facts.scale is not None
-    assert options.unit_distance is not None
-    table = lookup_table(facts.live, tf, options.unit_distance, facts.scale)
+    table = lookup_table(facts.live, looks, facts.scale)
     visible = visible_cloud(gaussians, table, options.light, pixel_width(options.screen_size or SIZE))
     if not (len(visible) or empty):
-        raise DataError(f"{tf.name}: not one of {len(gaussians)} Gaussians is visible; try another function")
+        raise DataError(f"{names_of(looks)}: not one of {len(gaussians)} Gaussians is visible; try another function")
     return visible
 
 
-def lookup_table(facts: LiveFacts, tf: Look, distance: float, scale: float) -> Looks:
-    """Build the lookup table of a function or a label table.
+def names_of(looks: LayerLooks) -> str:
+    """Return the names of all layers' functions, joined."""
+    return " + ".join(tf.name for tf, _ in looks)
 
-    Args:
-        facts: header of the live Gaussians.
-        tf: the look.
-        distance: opacity unit distance, world length; several looks have their own.
-        scale: unit-frame lengths per world length.
 
-    Raises:
-        DataError: a label without an entry.
-    """
-    if isinstance(tf, SeveralLooks):
-        tables = [lookup_table(one, look, own, scale) for one, (look, own) in zip(facts.layers, tf.looks, strict=True)]
-        return LayerTables(tuple(table for table in tables if not isinstance(table, LayerTables)))
-    if not isinstance(tf, LabelTable):
-        return Table.of_function(tf, facts.lo, facts.hi, distance * scale, facts.grain)
-    entries = {label.number: label for label in tf.labels}
-    return Palette.of_labels([entries[label.number] for label in facts.labels], distance * scale)
+def lookup_table(facts: LiveFacts, looks: LayerLooks, scale: float) -> Looks:
+    """Build the lookup table of looks, for live Gaussians with these facts; ``scale``: unit-frame per world length."""
+    tables: list[Table | Palette] = []
+    for layer, (tf, distance) in zip(facts.layers, looks, strict=True):
+        if isinstance(tf, LabelTable):
+            entries = {label.number: label for label in tf.labels}
+            tables.append(Palette.of_labels([entries[label.number] for label in layer.labels], distance * scale))
+        else:
+            tables.append(Table.of_function(tf, layer.lo, layer.hi, distance * scale, layer.grain))
+    return tables[0] if len(tables) == 1 else LayerTables(tuple(tables))
 
 
 def visible_cloud(gaussians: Gaussians, table: Looks, lighting: Lighting | None, pixel: float) -> Gaussians:
@@ -108,8 +89,8 @@ def lit(gaussians: Gaussians, axis: np.ndarray, lighting: Lighting | None) -> Ga
     return gaussians if lighting is None else relight(gaussians, axis, lighting)
 
 
-def resolve_look(name: str, header: PlyHeader | PlyOptions, function: SourceRequest) -> tuple[Look, PlyOptions]:
-    """Resolve a look on the data values or labels of a file, and return it with the layout of a file of that look.
+def resolve_look(name: str, header: PlyHeader | PlyOptions, function: SourceRequest) -> tuple[LayerLooks, PlyOptions]:
+    """Resolve the look of each layer of a file on its values or labels, and return it with the layout of such a file.
 
     Args:
         name: name of the file, for errors.
@@ -121,24 +102,38 @@ def resolve_look(name: str, header: PlyHeader | PlyOptions, function: SourceRequ
         DataError: a file without values, an unreadable function, or one that shows nothing of the range of values.
         UsageError: an invalid range or distance; a function for labels, or a table for values.
     """
+    from vvgt_cli.conversion.gaussian_files import layout_of
     from vvgt_cli.look import check_visible
 
     if header.live is None:
         raise DataError(
             f"{name}: its Gaussians carry no values, so their look is fixed; expected a .ply of 'vvgt convert --live'"
         )
-    if header.live.others:
-        return _several(name, header, function)
-    if function.layers:
-        first = function.layers[0].path
-        raise UsageError(f"{name}: has one layer; expected --tf or --labels instead of --layer {first}")
-    own, shown, distance, label = _layer_look(name, header, header.live, function, header.unit_distance)
-    if isinstance(shown, LabelTable):
-        check_labels([shown])
+    live, layers = header.live, header.live.layers
+    if live.others:
+        asked = _of_layers(name, layers, function)
+        placed = [
+            _layer_look(f"{name}, layer {k}", header, layer, asked.get(k, SourceRequest("")), layer.distance)
+            for k, layer in enumerate(layers)
+        ]
     else:
-        check_visible(shown, header.live.statistics())
-    light = light_of(function.light, own or header.light, header.space)
-    return shown, _options(header, shown, distance, label, light)
+        if function.layers:
+            first = function.layers[0].path
+            raise UsageError(f"{name}: has one layer; expected --tf or --labels instead of --layer {first}")
+        placed = [_layer_look(name, header, live, function, header.unit_distance)]
+        if isinstance(alone := placed[0][1], LabelTable):
+            check_labels([alone])
+        else:
+            check_visible(alone, live.statistics())
+    light = light_of(function.light, placed[0][0] or header.light, header.space)
+    looks, (_, _, distance, label) = [(shown, distance) for _, shown, distance, _ in placed], placed[0]
+    tf = [shown for shown, _ in looks] if live.others else looks[0][0]
+    return looks, replace(
+        header if isinstance(header, PlyOptions) else layout_of(header),
+        live=None, certificate=None, unit_distance=distance, unit_distance_label=label, light=light,
+        sh_degree=None, function=names_of(looks), optics=None,
+        legend=legend_text(tf, live.lo, live.hi, unit_of_values(live.unit, tf), live.quantity),
+    )  # fmt: skip
 
 
 def _layer_look(
@@ -158,26 +153,8 @@ def _layer_look(
     return None if given is None else tf.lighting, shown, *distance
 
 
-def _options(
-    header: PlyHeader | PlyOptions, shown: Look, distance: float, label: str, light: Lighting | None
-) -> PlyOptions:
-    """Return the layout of a file of a look."""
-    from vvgt_cli.conversion.gaussian_files import layout_of
-
-    old, live = header if isinstance(header, PlyOptions) else layout_of(header), header.live
-    tf = [one for one, _ in shown.looks] if isinstance(shown, SeveralLooks) else shown
-    unit = "" if live is None else unit_of_values(live.unit, tf)
-    return replace(
-        old, live=None, certificate=None, unit_distance=distance, unit_distance_label=label, light=light,
-        sh_degree=None, function=shown.name, optics=None,
-        legend=None if live is None else legend_text(tf, live.lo, live.hi, unit, live.quantity),
-    )  # fmt: skip
-
-
-def _several(name: str, header: PlyHeader | PlyOptions, function: SourceRequest) -> tuple[SeveralLooks, PlyOptions]:
-    """Return the looks of several layers: those that are given, and the file's for the others."""
-    assert header.live is not None
-    layers = header.live.layers
+def _of_layers(name: str, layers: Sequence[LiveFacts], function: SourceRequest) -> dict[int, SourceRequest]:
+    """Return what is requested for each of several layers, by its number; raise UsageError for a look of them all."""
     wrong = {"--tf": function.tf, "--labels": function.labels, "--opacity-unit-distance": function.unit_distance}
     wrong["--tf-range"] = None if function.tf_range == "data" else function.tf_range
     if given := [option for option, value in wrong.items() if value is not None]:
@@ -185,14 +162,7 @@ def _several(name: str, header: PlyHeader | PlyOptions, function: SourceRequest)
             f"{name}: has {len(layers)} layers, each with its own look, as --layer LAYER,tf=TF; remove "
             f"{' and '.join(given)}; {_listed(layers)}"
         )
-    asked = {layer_number(name, layers, one.path): one for one in function.layers}
-    placed = [
-        _layer_look(f"{name}, layer {k}", header, layer, asked.get(k, SourceRequest("")), layer.distance)
-        for k, layer in enumerate(layers)
-    ]
-    light = light_of(function.light, placed[0][0] or header.light, header.space)
-    looks = SeveralLooks(tuple((shown, distance) for _, shown, distance, _ in placed))
-    return looks, _options(header, looks, *placed[0][2:], light)
+    return {layer_number(name, layers, one.path): one for one in function.layers}
 
 
 def layer_number(name: str, layers: Sequence[LiveFacts], asked: str) -> int:
@@ -280,8 +250,8 @@ def recolored(
     Raises:
         DataError, UsageError: see `resolve_look` and `apply_function`; a range or a distance without a function.
     """
-    tf, options = resolve_look(name, header, function)
-    return apply_function(gaussians, header, tf, options, empty), options
+    looks, options = resolve_look(name, header, function)
+    return apply_function(gaussians, header, looks, options, empty), options
 
 
 MIP, XRAY = "mip", "xray"
@@ -320,7 +290,7 @@ def draw_gaussians(
         if function is not None:
             raise UsageError(f"--rule {MIP}: shows values, whatever their look; omit function and light")
         return lambda camera: grey(mip(gaussians, camera, facts.lo, facts.hi))
-    tf, _ = resolve_look(name, header, function or SourceRequest(""))
+    tf, _ = resolve_look(name, header, function or SourceRequest(""))[0][0]
     assert isinstance(tf, TransferFunction)
     distance = exposed_distance(tf, facts.statistics(), edge)
     table = Table.of_function(tf, facts.lo, facts.hi, distance, facts.grain * NO_GRAIN)

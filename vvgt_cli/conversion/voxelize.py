@@ -10,6 +10,7 @@ import numpy as np
 
 from vvgt_cli.conversion.recolored import grid_of, layer_number
 from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.field.reader import hollow
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.header import FileFacts
 from vvgt_cli.gaussians.live_facts import LABEL_ROW, LAYER_ID, LiveFacts
@@ -70,7 +71,7 @@ def make_grid(
     if like is not None:
         if dims or spacing:
             raise UsageError("--like gives the whole grid; remove --dims and --spacing")
-        found = replace(like, data=_nothing(like.dims), slope=1.0, intercept=0.0, segments=None)
+        found = replace(hollow(like, like.dims), segments=None)
     else:
         found = _regridded(_own_grid(name, header, gaussians, bool(dims or spacing)), dims, spacing)
     nx, ny, _ = found.dims
@@ -88,13 +89,8 @@ def _own_grid(name: str, header: FileFacts, gaussians: Gaussians, chosen: bool) 
     low, high = (gaussians.means - reach).min(axis=0), (gaussians.means + reach).max(axis=0)
     edges, first = (high - low) * place[0, 0], low * place[0, 0] + place[:3, 3]
     origin = first + edges / 2  # one voxel as large as the box
-    return Volume(
-        _nothing((1, 1, 1)), triple(edges.tolist()), tuple(origin.tolist()), name=name, space=space, unit=unit
-    )
-
-
-def _nothing(dims: Sequence[int]) -> np.ndarray:
-    return np.broadcast_to(np.uint8(0), tuple(dims)[::-1])
+    blank = np.zeros((1, 1, 1), np.uint8)
+    return Volume(blank, triple(edges.tolist()), tuple(origin.tolist()), name=name, space=space, unit=unit)
 
 
 def _regridded(grid: Volume, dims: Sequence[int] | None, spacing: Sequence[float] | None) -> Volume:
@@ -110,8 +106,8 @@ def _regridded(grid: Volume, dims: Sequence[int] | None, spacing: Sequence[float
     edges = np.array(spacing) if spacing else extent / counts
     middle = grid.affine[:3, :3] @ ((np.array(grid.dims) - 1) / 2) + grid.origin
     origin = middle - grid.axes @ (edges * (counts - 1) / 2)
-    data = _nothing([int(n) for n in counts])
-    return replace(grid, data=data, spacing=triple(edges.tolist()), origin=tuple(origin.tolist()))
+    found = hollow(grid, [int(n) for n in counts])
+    return replace(found, spacing=triple(edges.tolist()), origin=tuple(origin.tolist()))
 
 
 def live_planes(name: str, header: FileFacts, gaussians: Gaussians, layer: int | str | None, grid: Volume) -> Planes:

@@ -13,7 +13,7 @@ import numpy as np
 from vvgt_cli.cameras import Camera
 from vvgt_cli.dvr.layout import corners
 from vvgt_cli.dvr.scene import Scene
-from vvgt_cli.look.function import TransferFunctionLike
+from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.tables import extinction
 from vvgt_cli.volume import Volume
 
@@ -35,7 +35,7 @@ def trilinear(volume: Volume, points: np.ndarray) -> np.ndarray:
 def optics(scene: Scene, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return extinction (n,) per unit-frame length and colour (n, 3) of data values (n,); NaN is transparent."""
     known = np.isfinite(x)
-    tf = cast(TransferFunctionLike, scene.tf)
+    tf = cast(TransferFunction, scene.tf)
     clean = np.clip(np.where(known, x, 0.0), *tf.node_range())
     tau = extinction(tf.opacity(clean), scene.unit_distance) / scene.volume.unit_frame().scale
     return np.where(known, tau, 0.0), tf.color(clean)

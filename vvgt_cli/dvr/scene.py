@@ -10,7 +10,7 @@ import numpy as np
 
 from vvgt_cli.dvr.layout import Light, Texels, Voxels, pairs_fit
 from vvgt_cli.dvr.light import scene_light
-from vvgt_cli.look import Lighting, Named, TransferFunctionLike
+from vvgt_cli.look import Lighting, Named, TransferFunction
 from vvgt_cli.look.tables import Optics, build_tables
 from vvgt_cli.volume import Volume
 
@@ -89,7 +89,7 @@ class Scene:
     def build(
         cls,
         volume: Volume,
-        tf: TransferFunctionLike,
+        tf: TransferFunction,
         unit_distance: float,
         value_range: tuple[float, float] | None = None,
         bins: int | None = None,

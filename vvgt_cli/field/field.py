@@ -11,6 +11,7 @@ import numpy as np
 
 from vvgt_cli.cameras import Blocks, Camera
 from vvgt_cli.device import on_device
+from vvgt_cli.dvr.render import Viewed
 from vvgt_cli.field.digests import digest, values_digest
 from vvgt_cli.field.source import StyledVolume
 from vvgt_cli.field.workload import Workload, measure
@@ -45,14 +46,11 @@ class Picture(NamedTuple):
         return self.blocks or Blocks.whole(self.camera.width, self.camera.height)
 
 
-class ViewRenderer(Protocol):
+class ViewRenderer(Viewed, Protocol):
     """A renderer of pictures of a volume."""
 
     def expect(self, pictures: Sequence[Picture]) -> None:
         """Announce pictures, so that a volume in blocks can render them in a single pass."""
-
-    def view(self, camera: Camera, settings: RenderSettings, blocks: Blocks | None = None) -> np.ndarray:
-        """Return a picture (h, w, 4) float32, premultiplied RGBA; zero outside ``blocks`` where they are given."""
 
     def forget(self, picture: Picture) -> None:
         """Release a picture that will not be requested again."""

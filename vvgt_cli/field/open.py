@@ -26,6 +26,7 @@ from vvgt_cli.field.source import SourceRequest, StyledVolume, describe_source, 
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians.outputs import STDOUT
 from vvgt_cli.jit.ahead import COUNT_REAL, COUNT_WHOLE, for_blocks
+from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.labels import NO_LABELS
 from vvgt_cli.look.lighting import PICTURES
 from vvgt_cli.progress import Console
@@ -254,6 +255,7 @@ def _reader(source: StyledVolume, access: BlockAccess) -> tuple[Reader, float]:
 
     volume, frame = source.volume, source.volume.unit_frame()
     if not source.gridded:
+        assert isinstance(source.tf, TransferFunction)
         task, whole, stats = access.counts(volume)
         rule = kernel_rule(volume, lambda: whole.stored)
         optics = build_tables(

@@ -305,30 +305,19 @@ def load(request: SourceRequest, access: Access | None = None) -> StyledVolume:
         DataError: a file is not valid, or the function leaves the volume invisible.
         UsageError: the options do not suit the file.
     """
-    return load_all([request], access)[0]
-
-
-def load_all(requests: Sequence[SourceRequest], access: Access | None = None) -> list[StyledVolume]:
-    """Read one volume and return it under each of several looks.
-
-    Raises:
-        DataError, UsageError: see `load`.
-    """
     from vvgt_cli.look import read_transfer_function
     from vvgt_cli.look.resolve import parse_tf_range
 
-    functions = []  # which are small: report their errors before reading the volume
-    for request in requests:
-        tf = read_transfer_function(request.tf) if isinstance(request.tf, str) else request.tf
-        functions.append((tf, parse_tf_range(request.tf_range)))
-        if tf is None and request.tf_range != "data":
-            raise UsageError("--tf-range: it places the nodes of a function; expected --tf as well")
+    # the function is small: report its errors before reading the volume
+    tf = read_transfer_function(request.tf) if isinstance(request.tf, str) else request.tf
+    tf_range = parse_tf_range(request.tf_range)
+    if tf is None and request.tf_range != "data":
+        raise UsageError("--tf-range: it places the nodes of a function; expected --tf as well")
     own = access or Access()
-    content = own.open(requests[0].volume, requests[0].read)
-    sources = [_styled(one, content, *function, own) for one, function in zip(requests, functions, strict=True)]
-    if access is None and content is requests[0].volume:  # for several functions
-        sources = [source if source.gridded else replace(source, layout=content.layout) for source in sources]
-    return sources
+    content = own.open(request.volume, request.read)
+    source = _styled(request, content, tf, tf_range, own)
+    shared = access is None and content is request.volume and not source.gridded  # by several functions
+    return replace(source, layout=content.layout) if shared else source
 
 
 def _styled(

@@ -69,15 +69,8 @@ def turn(gaussians: Gaussians, up: str, *, inverse: bool = False) -> Gaussians:
         return gaussians
     if inverse:
         matrix, (x, y, z) = matrix.T, (-x, -y, -z)
-    means = gaussians.means.astype(np.float64) @ matrix.T
     quaternions = _quaternion_product((w, x, y, z), gaussians.quaternions.astype(np.float64))
-    return replace(
-        gaussians,
-        means=means.astype(np.float32),
-        quaternions=quaternions.astype(np.float32),
-        harmonics=turned(gaussians, matrix),
-        live=_normals_turned(gaussians, matrix),
-    )
+    return _mapped(gaussians, matrix, quaternions, gaussians.log_scales)
 
 
 def rescale(gaussians: Gaussians, factor: float, before: np.ndarray, after: np.ndarray) -> Gaussians:
@@ -112,6 +105,11 @@ def transform(gaussians: Gaussians, matrix: np.ndarray) -> Gaussians:
         factors = matrix @ rotations(quaternions) * np.exp(log_scales - largest)[:, None, :]
         quaternions, log_scales = factored(factors)
         log_scales += largest
+    return _mapped(gaussians, matrix, quaternions, log_scales)
+
+
+def _mapped(gaussians: Gaussians, matrix: np.ndarray, quaternions: np.ndarray, log_scales: np.ndarray) -> Gaussians:
+    """Return Gaussians after a linear map, which gives them these quaternions and log scales."""
     return replace(
         gaussians,
         means=(gaussians.means.astype(np.float64) @ matrix.T).astype(np.float32),

@@ -25,7 +25,7 @@ from vvgt_cli.gaussians.frames import axes_of, factored
 from vvgt_cli.gaussians.live_facts import AXIS, GRADIENT, LABEL_ROW, LAYER_ID
 from vvgt_cli.gaussians.opacity import mean_opacity, projected_areas
 from vvgt_cli.gaussians.types import Gaussians
-from vvgt_cli.look.function import TransferFunctionLike
+from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.labels import Label
 from vvgt_cli.look.tables import extinction
 
@@ -61,7 +61,7 @@ class Table:
     sums: np.ndarray
 
     @classmethod
-    def of_function(cls, tf: TransferFunctionLike, lo: float, hi: float, unit_distance: float, grain: float) -> Table:
+    def of_function(cls, tf: TransferFunction, lo: float, hi: float, unit_distance: float, grain: float) -> Table:
         """Return the table of a function on data values, whose opacity is per ``unit_distance``.
 
         ``grain`` is a voxel's edge (`LiveFacts.grain`), over which a value covers the background; both are unit-frame

@@ -361,9 +361,7 @@ def describe(gaussians: Gaussians, header: PlyHeader) -> dict[str, object]:
         sigma = np.exp(np.clip(gaussians.log_scales.astype(np.float64), -700, 700))
         for key, values in (("sigma", sigma), ("opacity", gaussians.opacity)):
             summary[key] = [float(f"{q:.6g}") for q in np.percentile(values, (0, 50, 100))]
-        summary["box_min"] = [float(v) for v in gaussians.means.min(axis=0)]
-        summary["box_max"] = [float(v) for v in gaussians.means.max(axis=0)]
-        summary["color_min"] = [float(v) for v in gaussians.colors.min(axis=0)]
-        summary["color_max"] = [float(v) for v in gaussians.colors.max(axis=0)]
+        for key, values in (("box", gaussians.means), ("color", gaussians.colors)):
+            summary |= {f"{key}_min": values.min(axis=0).tolist(), f"{key}_max": values.max(axis=0).tolist()}
         summary["harmonics_largest"] = float(np.abs(gaussians.arrays().get("harmonics", np.zeros(1))).max())
     return summary

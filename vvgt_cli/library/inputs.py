@@ -374,7 +374,9 @@ def volume_in_memory(
     placed = [key for key, value in (("origin", origin), ("affine", affine)) if value is not None]
     if hasattr(data, "IsA") and not isinstance(data, np.ndarray):  # pyvista's arrays have the methods of VTK's
         _refuse(placed, "a VTK dataset says itself where it is")
-        return dataset_volume(data, options, name)
+        from vvgt_cli.volume.vtk.leaves import dataset_volume
+
+        return dataset_volume(data, options, name, name)
     if hasattr(data, "dims") and hasattr(data, "coords") and hasattr(data, "attrs"):
         _refuse(placed, "the coordinates of a DataArray say where it is")
         return _labelled(data, options, name)
@@ -382,13 +384,6 @@ def volume_in_memory(
         data = data.astype(np.promote_types(data.dtype, np.float32)).filled(np.nan)
     values: Any = lazy(data, name) if is_dask(data) else np.asarray(data)
     return _array(values, options, origin, affine, name)
-
-
-def dataset_volume(data: Any, options: ReadOptions, name: str) -> Volume:
-    """Call `vvgt_cli.volume.vtk.leaves.dataset_volume`, which imports VTK."""
-    from vvgt_cli.volume.vtk import leaves as vtk_leaves
-
-    return vtk_leaves.dataset_volume(data, options, name, name)
 
 
 def _refuse(given: Sequence[str], why: str) -> None:

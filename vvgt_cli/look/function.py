@@ -39,22 +39,6 @@ class Named(Protocol):
         ...
 
 
-class TransferFunctionLike(Named, Protocol):
-    """The interface that the renderers need; `TransferFunction` implements it."""
-
-    def opacity(self, x: np.ndarray) -> np.ndarray:
-        """Return the opacity in [0, 1] per unit distance at data values x (n,), float64 -> (n,)."""
-        ...
-
-    def color(self, x: np.ndarray) -> np.ndarray:
-        """Return RGB in [0, 1] at data values x (n,), float64 -> (n, 3)."""
-        ...
-
-    def node_range(self) -> tuple[float, float]:
-        """Return the smallest and largest node position; beyond them the function is constant."""
-        ...
-
-
 @dataclass(frozen=True)
 class PiecewiseOpacity:
     """Opacity over the scalar: a vtkPiecewiseFunction with clamping, which may have several nodes at one position.
@@ -232,7 +216,7 @@ def _ciede2000_path(
 
 @dataclass(frozen=True)
 class TransferFunction:
-    """Colour and opacity per unit distance of a scalar; implements `TransferFunctionLike`.
+    """Colour and opacity per unit distance of a scalar.
 
     Attributes:
         name: for reports; mentions opacity or colour that were chosen because the source has none.

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.look.function import TransferFunctionLike
+from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.volume.stats import Statistics
 
 EXPOSED = 16  # values within a bin of the histogram
@@ -26,7 +26,7 @@ def extinction(opacity: np.ndarray, unit_distance: float) -> np.ndarray:
     return result
 
 
-def exposed_distance(tf: TransferFunctionLike, statistics: Statistics, edge: float) -> float:
+def exposed_distance(tf: TransferFunction, statistics: Statistics, edge: float) -> float:
     """Return the unit distance of an X-ray: a ray as long as ``edge`` through the volume's mean keeps 1/e.
 
     So an X-ray depends neither on the function's unit distance nor on how opaque the whole of it is.
@@ -118,7 +118,7 @@ def _flat_until(nodes: np.ndarray, most: float) -> np.ndarray:
     return at.astype(np.float64)
 
 
-def _bin_count(tf: TransferFunctionLike, lo: float, hi: float) -> int:
+def _bin_count(tf: TransferFunction, lo: float, hi: float) -> int:
     nodes = np.asarray(getattr(tf, "breakpoints", tf.node_range)(), np.float64)
     gaps = np.diff(np.unique(np.clip(nodes, lo, hi)))
     gaps = gaps[gaps > (hi - lo) / MAX_BINS]
@@ -127,7 +127,7 @@ def _bin_count(tf: TransferFunctionLike, lo: float, hi: float) -> int:
 
 
 def build_tables(
-    tf: TransferFunctionLike,
+    tf: TransferFunction,
     value_range: tuple[float, float],
     *,
     slope: float = 1.0,

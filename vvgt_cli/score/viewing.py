@@ -187,13 +187,7 @@ def near_cameras(size: int) -> list[Camera]:
 
 def texture_cameras(size: int) -> list[Camera]:
     """Return the cameras of a conversion's texture: the middle of the close view from the side."""
-    cameras = []
-    for i in SIDE:
-        whole = zoomed(default_views("test", size=size)[i], NEAR)
-        edge = size // TEXTURED
-        offset = (size - edge) // 2
-        cameras.append(replace(whole, cx=whole.cx - offset, cy=whole.cy - offset, width=edge, height=edge))
-    return cameras
+    return [zoomed(default_views("test", size=size)[i], NEAR).middle(size // TEXTURED) for i in SIDE]
 
 
 def texture_note(texture: Texture) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -11,6 +11,7 @@ import numpy as np
 from vvgt_cli.cameras import FEW, Blocks, Camera, default_views, drawn_pixels, picked, spread_blocks
 from vvgt_cli.gaussians import INRIA, Gaussians, Rule
 from vvgt_cli.progress import ProgressCallback
+from vvgt_cli.score.viewing import PREVIEW_VIEWS
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import RenderSettings, Scene, Viewed
@@ -18,18 +19,16 @@ if TYPE_CHECKING:
     from vvgt_cli.splat.render import Shown
 
 
-WHOLE = (0, 4, 9)  # test views drawn whole, for measures that blocks do not suffice for
+def scored_views(size: int, every: bool = True) -> list[tuple[int, Camera, Blocks | None]]:
+    """List number and camera of each scored test view, and the blocks of it that are drawn, None for all of it.
 
-
-def scored_views(
-    size: int, perceptual: bool, only: Collection[int] | None = None
-) -> list[tuple[int, Camera, Blocks | None]]:
-    """List number and camera of each scored test view, and the blocks of it that are drawn, None for all of it."""
+    They are those of previews, or all ten, of which those are drawn whole, for measures that blocks do not suffice for.
+    """
     cameras = default_views("test", size=size)
     views = []
-    for i in sorted(range(len(cameras)) if only is None else only):
+    for i in range(len(cameras)) if every else PREVIEW_VIEWS:
         blocks = spread_blocks(cameras[i].width, cameras[i].height, i)
-        views.append((i, cameras[i], None if perceptual and i in WHOLE else blocks))
+        views.append((i, cameras[i], None if every and i in PREVIEW_VIEWS else blocks))
     return views
 
 
@@ -42,11 +41,10 @@ def score_test_views(
     scene: Scene | Viewed,
     gaussians: Shown,
     size: int,
-    settings: RenderSettings,
+    settings: RenderSettings | None = None,
     *,
     rule: str | Rule = INRIA,
-    perceptual: bool = True,
-    only: Collection[int] | None = None,
+    every: bool = True,
     progress: ProgressCallback | None = None,
 ) -> Scores:
     """Score Gaussians on the test views at ``size`` px (docs/conventions.md, "Units of a report").
@@ -57,42 +55,39 @@ def score_test_views(
         size: pixels along an image's edge.
         settings: settings of the reference.
         rule: drawing rule of the Gaussians.
-        perceptual: SSIM and FLIP too, of whole pictures of the `WHOLE` views; other scores use blocks of large views.
-        only: numbers of the views to score; None for all ten.
+        every: all ten views, with SSIM and FLIP, of whole pictures of the `PREVIEW_VIEWS`; other scores use blocks of
+            large views. False for the PSNR of the `PREVIEW_VIEWS` alone.
         progress: called after each view.
     """
     from vvgt_cli.dvr import render_view
     from vvgt_cli.images.metrics import mean_scores
     from vvgt_cli.splat import render
 
-    views, wanted = [], scored_views(size, perceptual, only)
+    views, wanted = [], scored_views(size, every)
     for done, (i, camera, drawn) in enumerate(wanted):
         reference, ours = render_view(scene, camera, settings, drawn), render(gaussians, camera, rule, blocks=drawn)
         blocks = spread_blocks(camera.width, camera.height, i)
-        views.append(score_drawn_view(reference, ours, blocks, drawn is None, perceptual))
+        views.append(score_drawn_view(reference, ours, blocks, every and drawn is None))
         if progress:
             progress(done + 1, len(wanted))
     return mean_scores(views)
 
 
-def score_drawn_view(
-    reference: np.ndarray, ours: np.ndarray, blocks: Blocks | None, whole: bool = True, perceptual: bool = True
-) -> ViewScore:
-    """Score one view: errors of its blocks, if any; SSIM and FLIP of the whole, where it was drawn.
+def score_drawn_view(reference: np.ndarray, ours: np.ndarray, blocks: Blocks | None, whole: bool = True) -> ViewScore:
+    """Score one view: errors of its blocks, if any; SSIM and FLIP of the whole, where that was drawn for them.
 
     Args:
         reference: (h, w, 4) float32 premultiplied picture of the volume.
         ours: the same of the Gaussians.
         blocks: blocks of the view, or None for all of it.
-        whole: whether the whole view was drawn.
-        perceptual: SSIM and FLIP too.
+        whole: whether the whole view was drawn, for SSIM and FLIP too.
     """
     from vvgt_cli.images.metrics import score_view
 
     if blocks is None:
-        return score_view(reference, ours, perceptual=perceptual)
+        return score_view(reference, ours, perceptual=whole)
     score = score_view(blocks.pick(reference), blocks.pick(ours), perceptual=False)
-    if perceptual and whole:
+    if whole:
         seen = score_view(reference, ours)
         score = replace(score, ssim=seen.ssim, flip=seen.flip)
     return score

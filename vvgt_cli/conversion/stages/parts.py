@@ -11,7 +11,7 @@ import numpy as np
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.blocks import spread_blocks
 from vvgt_cli.conversion.cut import CutPlan, FinishedParts, cut_of, disk_bytes
-from vvgt_cli.conversion.parts import Refiner, choose_levels, closed_form_parts, refined_parts
+from vvgt_cli.conversion.parts import Refiner, choose_levels, closed_form_parts, make_parts
 from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.conversion.stages.closed_form import ClosedFormStage
 from vvgt_cli.conversion.stages.refinement import HARMONICS, early_end, steps_in_time
@@ -83,7 +83,8 @@ class OutOfCore(Stage):
             return
         made = closed_form_parts(run, field.run_pass, cut)
         if (refiner := self._refiner(work, field)) is not None:
-            made = refined_parts(run, field.run_pass, made, refiner)
+            everywhere = cut.everywhere(made.threshold)
+            made = replace(made, stored=make_parts(run, field.run_pass, cut, everywhere, refiner, least=False))
         work.parts = made
         if self.together:
             work.gaussians = made.gathered()

@@ -27,9 +27,9 @@ from vvgt_cli.score.viewing import (
     screens,
     texture_cameras,
 )
-from vvgt_cli.score.views import WHOLE, psnr_note, score_test_views, scored_views
+from vvgt_cli.score.views import psnr_note, score_test_views, scored_views
 
-SCORE, SCORE_ALL = (3, 0, 0.03), (10, len(WHOLE), 0.1)  # views, whole ones, extra seconds per 400 x 400 px
+SCORE, SCORE_ALL = (3, 0, 0.03), (10, len(PREVIEW_VIEWS), 0.1)  # views, whole ones, extra seconds per 400 x 400 px
 TEXTURE = 0.05  # extra seconds per 400 x 400 px
 CONDITIONS = 0.15, 0.155  # extra seconds: fixed, per 100,000 Gaussians
 
@@ -57,27 +57,15 @@ class TestViews(Stage):
         """List the pictures that are scored."""
         from vvgt_cli.dvr import RenderSettings
 
-        only = None if self.whole else PREVIEW_VIEWS
-        return [
-            Picture(camera, RenderSettings(), blocks)
-            for _, camera, blocks in scored_views(fit.screen, self.whole, only)
-        ]
+        return [Picture(camera, RenderSettings(), blocks) for _, camera, blocks in scored_views(fit.screen, self.whole)]
 
     def run(self, work: Work) -> None:
         """Score the Gaussians."""
-        from vvgt_cli.dvr import RenderSettings
-
         fit, run = work.fit, work.run
         with run.stage(self.name) as stage:
+            bar = run.console.bar(self.name)
             scores = score_test_views(
-                work.field.views,
-                work.shown,
-                fit.screen,
-                RenderSettings(),
-                rule=fit.rule,
-                perceptual=self.whole,
-                only=None if self.whole else PREVIEW_VIEWS,
-                progress=run.console.bar(self.name),
+                work.field.views, work.shown, fit.screen, rule=fit.rule, every=self.whole, progress=bar
             )
             run.report.scores = asdict(scores)
             stage.note = f"{psnr_note(scores)}, {scores.views} views of {fit.screen} px"
