@@ -6,7 +6,8 @@ python benchmarks/page.py --table page.csv
 
 Needs Chromium, node and npm, as `make viewers` does. Options of a scene are --spacing, --layer and --labels, its
 functions are files in FUNCTIONS or names, separated by spaces; "-": its own look. "first" and "rest" are PSNR in dB of
-one frame and of 8 jittered ones, on strips of the first view of an orbit, as WebGL in software is slow.
+one frame and of 8 jittered ones, on strips of the first view of an orbit, as WebGL in software is slow. The kind "cut"
+shows the upper half of x (of an upright volume), by a box on the page and by --crop. A function in a .label.json file is a table of labels.
 """
 
 from __future__ import annotations
@@ -43,6 +44,7 @@ KINDS = {
     "lit": (0, "headlight", None),
     "mip": (1, "none", "mip"),
     "xray": (2, "none", "xray"),
+    "cut": (0, "none", None),
 }  # number on the page, light, rule
 CAMERA = """(async () => {
   const { lens } = vvgt.where, { position, target } = FIRST;
@@ -53,7 +55,7 @@ CAMERA = """(async () => {
   await new Promise((done) => vvgt.viewer.app.once('frameend', done));
 })()"""
 LOOK = """(async () => {
-  const { look } = vvgt.live, { layers, light, kind, frames, tops, rows } = JOB;
+  const { look } = vvgt.live, { layers, light, kind, cut, frames, tops, rows } = JOB;
   layers.forEach(({ nodes, labels, unit_distance, opacity_unit_distance }, k) => {
     Object.assign(look.layers[k], { unit_distance, opacity_unit_distance });
     if (labels.length) look.labels(labels, k);
@@ -61,6 +63,7 @@ LOOK = """(async () => {
   });
   look.light(light);
   look.draw(kind);
+  vvgt.live.cut.change({ kind: 'box', box: [cut, 1, 0, 1, 0, 1] });
   const all = document.createElement('canvas'), to = all.getContext('2d'), begun = performance.now();
   [all.width, all.height] = [SIZE, tops.length * rows];
   for (const [k, top] of tops.entries()) {
@@ -92,6 +95,15 @@ def entry(file: str, look: Look, reading: Reading) -> dict[str, Any]:
     return look_entry(values, PlyOptions(scale=source.volume.unit_frame().scale, up="z", light=source.lighting))
 
 
+def moved(cameras: dict[str, Any], whole: vvgt.Volume, part: vvgt.Volume) -> dict[str, Any]:
+    """Cameras of a volume as its part has them: a file's unit frame is that of its own box."""
+    old, new = whole.unit_frame(), part.unit_frame()
+    for frame in cameras["frames"]:
+        for row, before, after in zip(frame["transform_matrix"][:3], old.centre, new.centre, strict=True):
+            row[3] = (row[3] / old.scale + before - after) * new.scale
+    return cameras
+
+
 def tops(size: int) -> list[int]:
     """The first row of each strip."""
     return [(2 * k + 1) * size // (2 * STRIPS) - ROWS // 2 for k in range(STRIPS)]
@@ -102,11 +114,11 @@ def strips(picture: np.ndarray) -> np.ndarray:
     return np.concatenate([picture[top : top + ROWS] for top in tops(len(picture))])
 
 
-def pictures(person: Person, look: dict[str, Any], kind: int, size: int, out: Path) -> dict[str, np.ndarray]:
+def pictures(person: Person, look: dict[str, Any], kind: int, cut: float, size: int, out: Path) -> dict[str, np.ndarray]:
     """Strips of pictures by the page, by `FRAMES`."""
     found = {}
     for name, frames in FRAMES.items():
-        job = json.dumps({**look, "kind": kind, "frames": frames, "tops": tops(size), "rows": ROWS})
+        job = json.dumps({**look, "kind": kind, "cut": cut, "frames": frames, "tops": tops(size), "rows": ROWS})
         content, took = person("eval", LOOK.replace("JOB", job).replace("SIZE", str(size)))
         file = out.with_name(f"{out.stem}-{name}.png")
         file.write_bytes(base64.b64decode(content))
@@ -138,6 +150,9 @@ def main(
         file = volume if volume.startswith("example:") else str(data / volume)
         reading, begun = reading_and_look(options, data)
         page = folder / f"{name}.html"
+        volume = load(source_of(file, begun, reading)).volume
+        width, turned = volume.dims[0], volume.axes[0, 0] < 0
+        half, share = Reading(crop=f":{width - width // 2},:,:" if turned else f"{width // 2}:,:,:"), width // 2 / width
         if not page.exists():
             vvgt.convert(file, begun, page, max_gaussians=500, screen=64, steps=0, **reading)
         person = person or Person((size, size))
@@ -148,19 +163,27 @@ def main(
             opened = name
         for one in function.split():
             tf = None if one == "-" else functions / one if (functions / one).exists() else one
-            distance = "mean-spacing" if one.endswith(".json") else None
+            table = one.endswith(".label.json")
+            distance = "mean-spacing" if one.endswith(".json") and not table else None
             for kind in kinds:
                 number, light, rule = KINDS[kind]
-                if number and (begun.layers or tf is None):
+                if number and (begun.layers or tf is None or table):
                     continue
-                look = replace(begun, tf=tf, opacity_unit_distance=distance, light=light)
+                look = replace(begun, opacity_unit_distance=distance, light=light, **{"labels" if table else "tf": tf})
+                cut = kind == "cut"
                 out = folder / f"{name}-{Path(one).stem}-{kind}"
                 own = out.with_name(f"{out.stem}.{size}.png")
                 if not own.exists():
+                    views = folder / name / "transforms.json"
+                    if cut and not views.exists():
+                        vvgt.render(file, views.parent, begun, orbit=1, size=size, **reading)
+                        kept = load(source_of(file, begun, reading | half)).volume
+                        views.write_text(json.dumps(moved(json.loads(views.read_text()), volume, kept)))
                     vvgt.render(
-                        file, own, look, size=size, rule=rule, background=None if rule else (0, 0, 0), **reading
-                    )
-                found = pictures(person, entry(file, look, reading), number, size, out)
+                        file, own, look, camera=views if cut else None, size=size, rule=rule,
+                        background=None if rule else (0, 0, 0), **(reading | half if cut else reading),
+                    )  # fmt: skip
+                found = pictures(person, entry(file, look, reading), number, share if cut else 0, size, out)
                 scores = {how: psnr(strips(read_png(own)[..., :3]), picture) for how, picture in found.items()}
                 rows.append({"scene": name, "function": Path(one).stem, "kind": kind, "size": size, **scores})
                 print(rows[-1], flush=True)

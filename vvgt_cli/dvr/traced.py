@@ -14,7 +14,7 @@ from vvgt_cli.dvr.sky import Sky
 DENSEST = 64.0  # optical depth a voxel: denser matter is as opaque, and would take as many steps more
 RAYS = 1 << 18  # that are cast at once
 MOST_RAYS = 1 << 23
-POINTS = 12  # a cell that views see
+POINTS = 16  # a cell that views see
 MOST_PATHS = 1 << 20
 TRIES = 8  # scatterings of a ray that are looked for
 FAINTEST = 1e-3  # colour of a ray below which nobody sees what it loses
