@@ -32,7 +32,7 @@ from vvgt_cli.volume.vtk.index import PIECES, Index, files_of, read_index
 from vvgt_cli.volume.vtk.leaves import Leaf, arrays_in, leaves_of
 from vvgt_cli.volume.vtk.legacy import check_legacy_grid
 from vvgt_cli.volume.vtk.messages import checked, quiet_vtk
-from vvgt_cli.volume.vtk.programs import PROGRAMS, read_program
+from vvgt_cli.volume.vtk.programs import read_program
 from vvgt_cli.volume.vtk.resample import MAX_EDGE
 from vvgt_cli.volume.vtk.xml import scan
 
@@ -281,7 +281,7 @@ def datasets(program: str, path: Path, time: int | None, array: str | None = Non
     if program in (SINGLE, IMAGE):
         return list(_dataset(path, ())), []
     if program != INDEX:
-        return read_program(PROGRAMS[program], path, time, array)
+        return read_program(program, path, time, array)
     index = read_index(path)
     return list(_indexed(index, time, ())), index.times
 
@@ -304,7 +304,7 @@ def _dataset(path: Path, above: tuple[Path, ...]) -> Iterator[Leaf]:
         yield from _indexed(read_index(path), None, above)
         return
     if head.startswith(HDF5):
-        yield from read_program(PROGRAMS["VTKHDF"], path, None)[0]
+        yield from read_program("VTKHDF", path, None)[0]
         return
     with quiet_vtk() as message:
         reader = _reader(path, kind, head)
