@@ -234,5 +234,4 @@ def read_legacy(path: Path, options: ReadOptions) -> Volume:
         )
     values = load_block(path, np.dtype(_TYPES[array.type]).newbyteorder(">"), shape, offset=array.start)
     field = select_from_array(values, array.info, options.component, str(path))
-    place = options.spacing_or(grid.spacing), grid.origin, grid.direction
-    return Volume(field, *place, volume_name(path), quantity=printable(array.info.name))
+    return grid.volume(field, array.info, options, volume_name(path))

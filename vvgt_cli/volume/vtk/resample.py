@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.reading import Volume, check_memory, count, float_dtype, triple
+from vvgt_cli.volume.components import ArrayInfo
+from vvgt_cli.volume.reading import IDENTITY, ReadOptions, Volume, check_memory, count, float_dtype, printable, triple
+from vvgt_cli.volume.space import unit_rows
 
 MAX_EDGE = 512  # voxels along an axis, where nobody said how many
 
@@ -51,24 +53,44 @@ def resample(
 
 
 @dataclass(frozen=True)
-class Samples:
-    """A regular grid of samples: dims, spacing, and the first sample, (x, y, z)."""
+class Grid:
+    """A regular grid of values: dims, spacing, and the place of the first, (x, y, z); direction row-major."""
 
     dims: tuple[int, int, int]
     spacing: tuple[float, float, float]
     origin: tuple[float, float, float]
+    direction: tuple[float, ...] = IDENTITY
+
+    @classmethod
+    def of_image(cls, extent: Any, spacing: Any, origin: Any, direction: Any, where: str) -> Grid:
+        """Return the grid of an image's points, or of its cell centres: half a voxel further, one fewer per axis.
+
+        ``extent`` (3, 2) are the first and last point along x, y and z, ``direction`` is row-major.
+        """
+        (low, high), axes = np.transpose(extent), np.reshape(direction, (3, 3))
+        dims = high - low + 1
+        if where == "cell":
+            low, dims = low + np.where(dims > 1, 0.5, 0.0), np.maximum(dims - 1, 1)
+        first = origin + (axes * (low * np.asarray(spacing))).sum(axis=1)
+        lengths, turned = unit_rows((axes * np.asarray(spacing)).T)
+        return cls(triple(dims.tolist()), triple(lengths), triple(first.tolist()), turned)
+
+    def volume(self, values: np.ndarray, info: ArrayInfo, options: ReadOptions, name: str) -> Volume:
+        """Make the volume of an array's values (nz, ny, nx)."""
+        place = options.spacing_or(self.spacing), self.origin, self.direction
+        return Volume(values, *place, name, quantity=printable(info.name))
 
 
-def grid_of(bounds: np.ndarray, dims: tuple[int, int, int] | None, cells: int, source: str) -> Samples:
+def grid_of(bounds: np.ndarray, dims: tuple[int, int, int] | None, cells: int, source: str) -> Grid:
     """Choose samples at the centres of voxels that fill ``bounds`` (3, 2); raise DataError if these are not finite."""
     if not np.isfinite(bounds).all():
         raise DataError(f"{source}: its bounding box {bounds.ravel().tolist()} is not finite")
     size, spacing = _grid(bounds, dims, cells)
     flat = bounds[:, 0] == bounds[:, 1]
-    return Samples(size, spacing, triple(np.where(flat, bounds[:, 0], bounds[:, 0] + np.array(spacing) / 2).tolist()))
+    return Grid(size, spacing, triple(np.where(flat, bounds[:, 0], bounds[:, 0] + np.array(spacing) / 2).tolist()))
 
 
-def probe(mesh: Any, values: np.ndarray, where: str, grid: Samples) -> tuple[np.ndarray, np.ndarray]:
+def probe(mesh: Any, values: np.ndarray, where: str, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     """Return samples (nz, ny, nx) of values (n,) of a vtkDataSet's points or cells, and a mask of those inside."""
     from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
     from vtkmodules.vtkCommonDataModel import vtkImageData
@@ -94,7 +116,7 @@ def probe(mesh: Any, values: np.ndarray, where: str, grid: Samples) -> tuple[np.
 
 
 def sampled_volume(
-    values: np.ndarray, inside: np.ndarray, dtype: np.dtype, grid: Samples, dims: object, source: str, name: str
+    values: np.ndarray, inside: np.ndarray, dtype: np.dtype, grid: Grid, dims: object, source: str, name: str
 ) -> Volume:
     """Make the volume of samples, and warn of their number if ``dims`` is None; raise DataError if none is inside.
 

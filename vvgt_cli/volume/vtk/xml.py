@@ -24,11 +24,12 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import count, load_block
 from vvgt_cli.volume.components import ArrayInfo, choose_array, magnitude, select_from_array, selected_dtype
 from vvgt_cli.volume.readers import HEAD_BYTES, lazy, volume_name
-from vvgt_cli.volume.reading import ReadOptions, Slices, printable, type_of, unit_rows
+from vvgt_cli.volume.reading import ReadOptions, Slices, type_of
 from vvgt_cli.volume.stored import stored_or_loaded
 from vvgt_cli.volume.types import IDENTITY, Volume
 from vvgt_cli.volume.vtk import IMAGE, xml_kind
 from vvgt_cli.volume.vtk.messages import quiet_vtk
+from vvgt_cli.volume.vtk.resample import Grid
 
 DATA = {"PointData": "point", "CellData": "cell", "PPointData": "point", "PCellData": "cell"}
 GHOSTS = "vtkGhostType"  # array of marks: bit 1 of a point and bit 5 of a cell hide it (vtkDataSetAttributes)
@@ -182,46 +183,22 @@ def _numbers(text: str, n: int, path: Path, what: str) -> list[float]:
     return values
 
 
-@dataclass(frozen=True)
-class Grid:
-    """Dims, origin and spacing (x, y, z) of the values, direction row-major."""
-
-    dims: tuple[int, ...]
-    origin: tuple[float, ...]
-    spacing: tuple[float, ...]
-    direction: tuple[float, ...]
-
-
-def extent_of(text: str, path: Path, what: str = "WholeExtent") -> list[int]:
-    """Parse the six numbers of an extent, or raise DataError."""
-    return [int(e) for e in _numbers(text, 6, path, what)]
-
-
-def extent_dims(image: dict[str, str], path: Path) -> list[int]:
-    """Return the points along (x, y, z) of an image or structured grid; raise DataError if there are none."""
-    extent = extent_of(image.get("WholeExtent", ""), path)
-    dims = [extent[2 * k + 1] - extent[2 * k] + 1 for k in range(3)]
-    if min(dims) < 1:
-        raise DataError(f"{path}: WholeExtent {extent} is empty; expected at least one voxel along each axis")
-    return dims
+def extent_of(text: str, path: Path, what: str = "WholeExtent") -> np.ndarray:
+    """Parse an extent, (3, 2) int64: first and last point along x, y and z; raise DataError for anything else."""
+    return np.array([int(e) for e in _numbers(text, 6, path, what)], np.int64).reshape(3, 2)
 
 
 def image_grid(image: dict[str, str], where: str, path: Path) -> Grid:
-    """Return the grid of points, or of cell centres (half a voxel further, one fewer per axis), or raise DataError."""
-    extent, dims = extent_of(image.get("WholeExtent", ""), path), extent_dims(image, path)
+    """Return the grid of an image's points or cells, or raise DataError."""
+    extent = extent_of(image.get("WholeExtent", ""), path)
+    if (extent[:, 0] > extent[:, 1]).any():
+        raise DataError(
+            f"{path}: WholeExtent {extent.ravel().tolist()} is empty; expected at least one voxel along each axis"
+        )
     spacing = _numbers(image.get("Spacing", "1 1 1"), 3, path, "Spacing")
     origin = _numbers(image.get("Origin", "0 0 0"), 3, path, "Origin")
-    direction: tuple[float, ...] = IDENTITY
-    if "Direction" in image:
-        direction = tuple(_numbers(image["Direction"], 9, path, "Direction"))
-    first = [float(extent[2 * k]) for k in range(3)]
-    if where == "cell":
-        first = [f + 0.5 if d > 1 else f for f, d in zip(first, dims, strict=True)]
-        dims = [max(d - 1, 1) for d in dims]
-    step = [f * s for f, s in zip(first, spacing, strict=True)]
-    origin = [o + sum(direction[3 * row + k] * step[k] for k in range(3)) for row, o in enumerate(origin)]
-    axes = [[direction[3 * row + k] * spacing[k] for row in range(3)] for k in range(3)]
-    return Grid(tuple(dims), tuple(origin), *unit_rows(axes))
+    direction = _numbers(image["Direction"], 9, path, "Direction") if "Direction" in image else IDENTITY
+    return Grid.of_image(extent, spacing, origin, direction, where)
 
 
 def read_vti(path: Path, options: ReadOptions) -> Volume:
@@ -235,8 +212,7 @@ def read_vti(path: Path, options: ReadOptions) -> Volume:
     info = header.infos[choose_array(header.infos, options.array, str(path))]
     grid = image_grid(header.image, info.where, path)
     values = image_values(header, info, grid, options, path)
-    place = options.spacing_or(grid.spacing), grid.origin, grid.direction
-    return Volume(values, *place, volume_name(path), quantity=printable(info.name))
+    return grid.volume(values, info, options, volume_name(path))
 
 
 def time_value(path: Path) -> float | None:
