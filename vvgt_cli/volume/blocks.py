@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import bz2
 import gzip
+import lzma
 import math
 import mmap
 import warnings
@@ -23,6 +24,7 @@ from vvgt_cli.resources import free_memory
 # The most that each coding can expand: deflate 258 bytes from 2 bits, bzip2 about 900 kB from some 40 bytes.
 MAX_RATIO = {"gzip": 1040, "zlib": 1040, "bzip2": 25000}
 SHARE = 0.25  # of the free memory: what takes less is decompressed at once
+LZMA_MEMORY = 1 << 28  # bytes of a dictionary: the strongest preset needs a quarter, a damaged header says gigabytes
 _CHUNK = 1 << 20
 
 
@@ -80,6 +82,23 @@ _OPENERS: dict[str, Callable[[IO[bytes]], Any]] = {
     "bzip2": lambda file: bz2.BZ2File(file),
     "zlib": _ZlibStream,
 }
+
+
+_ENGINES: dict[str, Callable[[], Any]] = {
+    "gzip": lambda: zlib.decompressobj(31),
+    "zlib": zlib.decompressobj,
+    "bzip2": bz2.BZ2Decompressor,
+    "xz": lambda: lzma.LZMADecompressor(memlimit=LZMA_MEMORY),
+}
+
+
+def unpack(coding: str, data: bytes | memoryview, most: int) -> bytes:
+    """Unpack at most ``most`` bytes of ``gzip``, ``zlib``, ``bzip2``, ``xz`` or one block of ``lz4``."""
+    if coding == "lz4":
+        import lz4.block
+
+        return bytes(lz4.block.decompress(data, uncompressed_size=most))
+    return bytes(_ENGINES[coding]().decompress(data, most))
 
 
 def read_head(path: Path, size: int) -> tuple[bytes, str]:

@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import base64
 import binascii
-import lzma
 import re
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,7 +19,7 @@ from xml.parsers import expat
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.blocks import count, load_block
+from vvgt_cli.volume.blocks import count, load_block, unpack
 from vvgt_cli.volume.components import ArrayInfo, choose_array, magnitude, select_from_array, selected_dtype
 from vvgt_cli.volume.readers import HEAD_BYTES, lazy, volume_name
 from vvgt_cli.volume.reading import ReadOptions, Slices, type_of
@@ -35,7 +33,6 @@ DATA = {"PointData": "point", "CellData": "cell", "PPointData": "point", "PCellD
 GHOSTS = "vtkGhostType"  # array of marks: bit 1 of a point and bit 5 of a cell hide it (vtkDataSetAttributes)
 HIDDEN = {"point": 2, "cell": 32}
 TAIL = 4096  # bytes in which a file with appended data ends
-LZMA_MEMORY = 1 << 28  # bytes of its dictionary
 IMAGE_BY_VTK = lazy("vtk.child.volume_by_child", IMAGE)  # path and options to volume
 _CHUNK = 1 << 16
 
@@ -250,7 +247,7 @@ def image_values(header: Scan, info: ArrayInfo, grid: Grid, options: ReadOptions
         if appended and header.appended == "raw" and not compressor:
             stored = _mapped(header, info, grid, start, path)
             return select_from_array(stored, info, options.component, str(path))
-        if compressor in _UNPACK and (form == "binary" or (appended and header.appended in ("raw", "base64"))):
+        if compressor in _CODINGS and (form == "binary" or (appended and header.appended in ("raw", "base64"))):
             start = start if appended else _text_of(path, row.position)
             coded = not appended or header.appended == "base64"
             packed: np.ndarray = packed_array(header, info, grid, start, coded, options, path)
@@ -323,7 +320,7 @@ def packed_array(
     begins = np.concatenate([[0], np.cumsum(sizes)])
     size = len(words) * word.itemsize
     place = start + (4 * -(-size // 3) if coded else size)
-    packed = _Blocks(path, _UNPACK[header.root["compressor"]], coded, place, begins, each, need)
+    packed = _Blocks(path, _CODINGS[header.root["compressor"]], coded, place, begins, each, need)
     _, ny, nx, components = shape
     row = nx * components * dtype.itemsize
 
@@ -346,17 +343,7 @@ def packed_array(
     return stored_or_loaded(read, kind, shape[:3], chunks, str(path), options.stored)
 
 
-def _lz4(data: bytes, need: int) -> bytes:
-    import lz4.block
-
-    return bytes(lz4.block.decompress(data, uncompressed_size=need))
-
-
-_UNPACK: dict[str, Callable[[bytes, int], bytes]] = {
-    "vtkZLibDataCompressor": lambda data, need: zlib.decompressobj().decompress(data, need + 1),
-    "vtkLZ4DataCompressor": _lz4,
-    "vtkLZMADataCompressor": lambda data, need: lzma.LZMADecompressor(memlimit=LZMA_MEMORY).decompress(data, need + 1),
-}
+_CODINGS = {"vtkZLibDataCompressor": "zlib", "vtkLZ4DataCompressor": "lz4", "vtkLZMADataCompressor": "xz"}
 
 
 @dataclass(frozen=True)
@@ -365,7 +352,7 @@ class _Blocks:
 
     Attributes:
         path: the file.
-        unpack: unpacks a block, to few bytes more than the size that is given.
+        coding: of `blocks.unpack`.
         coded: in base64.
         place: byte of the file where they begin.
         begins: (n + 1) packed bytes before each, and in all.
@@ -374,7 +361,7 @@ class _Blocks:
     """
 
     path: Path
-    unpack: Callable[[bytes, int], bytes]
+    coding: str
     coded: bool
     place: int
     begins: np.ndarray
@@ -406,7 +393,7 @@ class _Blocks:
             return data[lo % 3 : lo % 3 + hi - lo]
 
     def _unpacked(self, data: bytes, need: int) -> bytes:
-        out = self.unpack(data, need)
+        out = unpack(self.coding, data, need + 1)
         if len(out) != need:
             raise ValueError(f"a block of {len(out)} bytes where {need} are expected")
         return out
