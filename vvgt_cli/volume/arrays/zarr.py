@@ -137,10 +137,8 @@ def _metadata(folder: Path) -> dict[str, Any]:
     for name in _METADATA:
         file = folder / name
         if file.is_file():
-            facts = json_object(file)
-            if name == ".zarray":
-                return {"node_type": "array", **facts}
-            return {"node_type": "group", **facts} if name == ".zgroup" else facts
+            kind = {".zarray": {"node_type": "array"}, ".zgroup": {"node_type": "group"}}.get(name, {})
+            return kind | json_object(file)
     return {}
 
 

@@ -166,11 +166,8 @@ def received(stream: IO[bytes]) -> tuple[dict[str, Any], np.ndarray] | None:
 
 
 def _ended(path: Path, program: str, status: int, seconds: int) -> DataError:
-    who = (
-        "ecCodes"
-        if program == GRIB
-        else f"VTK's reader of {'VTK' if program in (INDEX, SINGLE, IMAGE) else program} files"
-    )
+    own = {INDEX: "VTK", SINGLE: "VTK", IMAGE: "VTK"}
+    who = "ecCodes" if program == GRIB else f"VTK's reader of {own.get(program, program)} files"
     if status in STOPPED:
         return DataError(
             f"{path}: {who} was stopped (after {seconds} s, a minute of standstill, or for its memory); is it whole?"
