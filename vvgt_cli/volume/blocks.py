@@ -12,7 +12,7 @@ import math
 import mmap
 import warnings
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
@@ -270,35 +270,25 @@ def fill(stream: Any, need: int) -> tuple[np.ndarray, int]:
     return out, filled
 
 
-def tokens(text: bytes | mmap.mmap, start: int, n: int, name: str) -> Iterator[tuple[list[bytes], int]]:
-    """Yield ``n`` white-space separated words of ``text`` from ``start`` on, by windows: (words, position behind them).
+def parse_numbers(text: bytes | mmap.mmap, start: int, n: int, dtype: np.dtype, name: str) -> np.ndarray:
+    """Parse ``n`` numbers between white space from ``start`` on, (n,) native, window by window.
 
-    Raise DataError if there are fewer.
+    Raise DataError if there are fewer, or others.
     """
-    missing, position = n, start
-    while missing:
+    native = dtype.newbyteorder("=")
+    check_memory(n * native.itemsize, name, AS_NUMBERS)
+    values, filled, position = np.empty(n, native), 0, start
+    while filled < n:
         window = text[position : position + _CHUNK]
         if not window:
-            raise DataError(f"{name}: the text holds {n - missing} values, expected {n}; check that the file is whole")
+            raise DataError(f"{name}: the text holds {filled} values, expected {n}; check that the file is whole")
         if position + len(window) < len(text):
             cut = max(window.rfind(c) for c in (b" ", b"\n", b"\t", b"\r"))
             window = window[: cut + 1] or window
         if isinstance(text, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
             text.madvise(mmap.MADV_DONTNEED)  # its pages are not read again
-        words = window.split(None, missing)
         position += len(window)
-        if len(words) > missing:
-            position -= len(words.pop())
-        missing -= len(words)
-        yield words, position
-
-
-def parse_numbers(text: bytes | mmap.mmap, start: int, n: int, dtype: np.dtype, name: str) -> np.ndarray:
-    """Parse ``n`` numbers of text from ``start`` on, (n,) native; raise DataError if there are fewer, or others."""
-    native = dtype.newbyteorder("=")
-    check_memory(n * native.itemsize, name, AS_NUMBERS)
-    values, filled = np.empty(n, native), 0
-    for words, _ in tokens(text, start, n, name):
+        words = window.split(None, n - filled)[: n - filled]
         try:
             values[filled : filled + len(words)] = np.array(words, dtype="S").astype(native)
         except (ValueError, OverflowError) as error:

@@ -3,8 +3,7 @@
 Localisers (scouts), segmentations and single images of another orientation are skipped where one stack remains, and a
 warning says so; where several remain, the error lists them.
 
-Files of a folder or a zip archive are found by content: one begins with a preamble and ``DICM`` (PS3.10, 7.1), or, as
-older programs wrote it, with the data set itself.
+Files of a folder or a zip archive are found by content (`vvgt_cli.volume.dicom.is_dicom`).
 """
 
 from __future__ import annotations

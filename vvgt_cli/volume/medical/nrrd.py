@@ -264,18 +264,16 @@ def _volume(path: Path, fields: HeaderFields, block: np.ndarray, sizes: list[int
     block = block[..., None] if axis is None else np.moveaxis(block, len(sizes) - 1 - axis, -1)
     if block.ndim == 3:
         block = block[None]
-    color = "rgb" in fields.get("kinds", "").lower()
     label = f"axis {axis}" if axis is not None else ""
-    component = options.component
-    kinds = fields.get("kinds", "").lower().split()
-    kind = kinds[axis] if axis is not None and axis < len(kinds) else ""
+    component, kinds = options.component, fields.get("kinds", "").lower()
+    kind = dict(enumerate(kinds.split())).get(axis, "") if axis is not None else ""
     if kind == "time" or (kind == "list" and _SEQUENCE.search(path.name)):
         component = _step(block, options, str(path))
     elif options.time:
         raise UsageError(
             f"{path}: no axis of time (of kind time, or list in a .seq.nrrd); leave out --time {options.time}"
         )
-    field, _ = select_component(block, component, str(path), label=label, color=color)
+    field, _ = select_component(block, component, str(path), label=label, color="rgb" in kinds)
     return placed(field, **place)
 
 

@@ -24,6 +24,7 @@ import numpy as np
 from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, SeveralSteps, UsageError, VvgtError
 from vvgt_cli.resources import free_memory
 from vvgt_cli.volume.arrays.grib import GRIB, grib_volume
+from vvgt_cli.volume.blocks import fill
 from vvgt_cli.volume.readers import HDF5, HEAD_BYTES, volume_name
 from vvgt_cli.volume.reading import ArrayInfo, ReadOptions, Volume, check_memory, count
 from vvgt_cli.volume.vtk import GRIDS, IMAGE, INDEX, INDEXES, SINGLE, is_index, is_legacy, xml_kind
@@ -154,15 +155,10 @@ def received(stream: IO[bytes]) -> tuple[dict[str, Any], np.ndarray] | None:
         return None
     facts = json.loads(line)
     dtype, shape = np.dtype(facts.pop("dtype", "u1")), tuple(facts.pop("shape", (0,)))
-    check_memory(count(shape) * dtype.itemsize, str(facts.get("name")))
-    values = np.empty(shape, dtype)
-    view, filled = values.reshape(-1).view(np.uint8).data, 0
-    while filled < values.nbytes:
-        n = stream.readinto(view[filled:])  # type: ignore[attr-defined]
-        if not n:
-            return None
-        filled += n
-    return facts, values
+    need = count(shape) * dtype.itemsize
+    check_memory(need, str(facts.get("name")))
+    values, filled = fill(stream, need)
+    return (facts, values.view(dtype).reshape(shape)) if filled == need else None
 
 
 def _ended(path: Path, program: str, status: int, seconds: int) -> DataError:
