@@ -14,7 +14,7 @@ import warnings
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, cast
 
 import numpy as np
 
@@ -153,9 +153,7 @@ def load_block(
             f"{size_text(need + skip)} that its header declares; check the header's sizes and type"
         )
     if packed and len(shape) == 3 and is_large(need):
-        left: Any = Packed(path, dtype, shape, encoding, (offset, skip))
-        result: np.ndarray = left
-        return result
+        return cast(np.ndarray, Packed(path, dtype, shape, encoding, (offset, skip)))
     return _decompressed(path, dtype, shape, offset, encoding, skip)
 
 

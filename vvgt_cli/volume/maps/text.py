@@ -199,5 +199,4 @@ def _vasp_cell(file: IO[bytes], path: Path) -> np.ndarray:
     selective = "".join(_words(file, path, "the kind of coordinates")).lower().startswith("s")
     for _ in range(min(atoms, MAX_ATOMS) + selective):
         _words(file, path, "an atom")
-    result: np.ndarray = cell * scale
-    return result
+    return np.asarray(cell * scale)

@@ -47,11 +47,10 @@ class Header:
     pixdim: tuple[float, ...]
     qform: tuple[float, ...] | None = None
     sform: tuple[float, ...] | None = None
-    unit: float = 1.0  # mm
+    unit: float = 0.0  # in mm; 0 unknown
     samples: int = 0  # bytes of a voxel that is a colour
     start: float = 0.0  # of time, in its unit
     time_unit: str = ""  # where the header states one
-    unit_known: bool = False  # of lengths
 
 
 def parse_header(head: bytes, name: str) -> Header:
@@ -96,11 +95,10 @@ def parse_header(head: bytes, name: str) -> Header:
         pixdim,
         quatern if q_code > 0 else None,
         sform if s_code > 0 else None,
-        {1: 1e3, 3: 1e-3}.get(units & 7, 1.0),  # metres, micrometres
+        {1: 1e3, 2: 1.0, 3: 1e-3}.get(units & 7, 0.0),  # metres, millimetres, micrometres
         _COLORS.get(code, 0),
         start,
         {8: "s", 16: "ms", 24: "us"}.get(units & 0x38, ""),
-        units & 7 in (1, 2, 3),
     )
 
 
@@ -196,9 +194,9 @@ def _volume(header: Header, path: Path, encoding: str, options: ReadOptions) -> 
             frames = replace(frames, start=header.start, step=header.pixdim[4], unit=header.time_unit)
         field, (slope, intercept) = load_frames(frames, options, str(path))
     spacing, direction, first, space = _place(header)
-    steps = tuple(header.unit * s if n > 1 or s else 1.0 for s, n in zip(spacing, reversed(field.shape), strict=True))
-    origin = tuple(header.unit * o for o in first)
-    unit = "mm" if header.unit_known else ""
+    unit, mm = "mm" if header.unit else "", header.unit or 1.0
+    steps = tuple(mm * s if n > 1 or s else 1.0 for s, n in zip(spacing, reversed(field.shape), strict=True))
+    origin = tuple(mm * o for o in first)
     return Volume(
         field, options.spacing_or(steps), origin, direction, volume_name(path), slope, intercept, space, unit=unit
     )

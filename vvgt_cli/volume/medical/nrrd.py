@@ -190,8 +190,7 @@ def _third(axes: list[list[float]]) -> np.ndarray:
     unit = np.reshape(unit_rows([*axes, [0.0, 0.0, 1.0]])[1], (3, 3)).T
     normal = np.cross(unit[0], unit[1])
     length = np.linalg.norm(normal)
-    result: np.ndarray = normal / length if length > 0 else unit[2]
-    return result
+    return np.asarray(normal / length if length > 0 else unit[2])
 
 
 def _space(fields: HeaderFields) -> tuple[np.ndarray, str | None]:

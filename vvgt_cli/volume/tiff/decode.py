@@ -86,8 +86,7 @@ class Pages(ExitStack):
                 )
             pixels = image.read_image(page.index, 0, 0, spec.nchannels, spec.format)
             if pixels is not None:
-                result: np.ndarray = pixels.reshape(expected)
-                return result
+                return np.asarray(pixels.reshape(expected))
         text = _one_line(image.geterror())
         if keyframe.compression in _CODINGS:
             raise DataError(f"{self._path}: page {page.index} is damaged ({text})")
@@ -111,8 +110,7 @@ class Pages(ExitStack):
                 f"{self._path}: page {page.index} has {values.size} values of {values.dtype} when decoded; expected "
                 f"{keyframe.size} of {series.dtype}"
             )
-        result: np.ndarray = values
-        return result
+        return np.asarray(values)
 
     def _check_segments(self, page: Any, keyframe: Any) -> None:
         """Refuse pages that lack parts, parts beyond the file, and parts that unpack to more than the page.

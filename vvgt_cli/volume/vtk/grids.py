@@ -21,8 +21,7 @@ def values_of(mesh: Any, info: ArrayInfo) -> np.ndarray:
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     data = mesh.GetPointData() if info.where == "point" else mesh.GetCellData()
-    result: np.ndarray = vtk_to_numpy(data.GetArray(info.name))
-    return result
+    return np.asarray(vtk_to_numpy(data.GetArray(info.name)))
 
 
 def arrays_of(mesh: Any) -> list[ArrayInfo]:

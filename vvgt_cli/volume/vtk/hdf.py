@@ -43,11 +43,7 @@ def _image(h5py: Any, file: Any, path: Path, options: ReadOptions) -> Volume:
     if options.dims is not None:
         raise UsageError(f"{source}: an image, which is a regular grid already; leave out --dims")
     times = _times(h5py, file, path)
-    time = options.time
-    if chosen_time(times, time, source) is None:
-        time = None
-    elif time is None:
-        time = 0  # the only one
+    time = None if chosen_time(times, options.time, source) is None else options.time or 0
     image = {key: " ".join(map(str, np.ravel(root.attrs[key]).tolist())) for key in PLACE if key in root.attrs}
     infos = _arrays(h5py, root, len(times) > 0)
     info = infos[choose_array(infos, options.array, source)]

@@ -223,8 +223,7 @@ def read_legacy(path: Path, options: ReadOptions) -> Volume:
         if binary:
             array = parser.arrays[choose_array([a.info for a in parser.arrays], options.array, str(path))]
         if not binary or array.type == "bit":
-            volume: Volume = IMAGE_BY_VTK(path, replace(options, array=array.info.name) if binary else options)
-            return volume
+            return IMAGE_BY_VTK(path, replace(options, array=array.info.name) if binary else options)
         grid = image_grid(_image(parser), array.info.where, path)
     shape = (*reversed(grid.dims), array.info.components)
     if count(shape[:3]) != array.tuples:

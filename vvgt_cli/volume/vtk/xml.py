@@ -13,7 +13,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import cast
 from xml.parsers import expat
 
 import numpy as np
@@ -33,7 +33,7 @@ DATA = {"PointData": "point", "CellData": "cell", "PPointData": "point", "PCellD
 GHOSTS = "vtkGhostType"  # array of marks: bit 1 of a point and bit 5 of a cell hide it (vtkDataSetAttributes)
 HIDDEN = {"point": 2, "cell": 32}
 TAIL = 4096  # bytes in which a file with appended data ends
-IMAGE_BY_VTK = lazy("vtk.child.volume_by_child", IMAGE)  # path and options to volume
+IMAGE_BY_VTK: Callable[[Path, ReadOptions], Volume] = lazy("vtk.child.volume_by_child", IMAGE)
 _CHUNK = 1 << 16
 
 
@@ -250,9 +250,8 @@ def image_values(header: Scan, info: ArrayInfo, grid: Grid, options: ReadOptions
         if compressor in _CODINGS and (form == "binary" or (appended and header.appended in ("raw", "base64"))):
             start = start if appended else _text_of(path, row.position)
             coded = not appended or header.appended == "base64"
-            packed: np.ndarray = packed_array(header, info, grid, start, coded, options, path)
-            return packed
-    values: np.ndarray = IMAGE_BY_VTK(path, replace(options, array=info.name or None, spacing=None)).data
+            return packed_array(header, info, grid, start, coded, options, path)
+    values = IMAGE_BY_VTK(path, replace(options, array=info.name or None, spacing=None)).data
     if values.shape != grid.dims[::-1]:
         raise DataError(f"{path}: points and cells have an array {info.name!r} each; rename one of them")
     return values
@@ -297,7 +296,7 @@ def block_table(path: Path, start: int, word: np.dtype, coded: bool) -> np.ndarr
 
 def packed_array(
     header: Scan, info: ArrayInfo, grid: Grid, start: int, coded: bool, options: ReadOptions, path: Path
-) -> Any:
+) -> np.ndarray:
     """Read a component (nz, ny, nx) of a compressed array, or leave it in its file.
 
     The first word before its blocks is at byte ``start``; ``coded``: all is in base64.
@@ -340,7 +339,7 @@ def packed_array(
 
     rows = max(each // row, 1)
     chunks = (max(rows // ny, 1), min(rows, ny), nx)
-    return stored_or_loaded(read, kind, shape[:3], chunks, str(path), options.stored)
+    return cast(np.ndarray, stored_or_loaded(read, kind, shape[:3], chunks, str(path), options.stored))
 
 
 _CODINGS = {"vtkZLibDataCompressor": "zlib", "vtkLZ4DataCompressor": "lz4", "vtkLZMADataCompressor": "xz"}
@@ -378,7 +377,9 @@ class _Blocks:
             if k not in kept:
                 part = packed[int(self.begins[k]) - begin : int(self.begins[k + 1]) - begin]
                 kept.clear()
-                kept[k] = self._unpacked(part, min(self.each, self.size - k * self.each))
+                need, kept[k] = min(self.each, self.size - k * self.each), unpack(self.coding, part, self.each + 1)
+                if len(kept[k]) != need:
+                    raise ValueError(f"a block of {len(kept[k])} bytes where {need} are expected")
             parts.append(kept[k])
         return b"".join(parts)[lo - first * self.each : hi - first * self.each]
 
@@ -391,9 +392,3 @@ class _Blocks:
             file.seek(self.place + lo // 3 * 4)
             data = base64.b64decode(file.read((-(-hi // 3) - lo // 3) * 4), validate=True)
             return data[lo % 3 : lo % 3 + hi - lo]
-
-    def _unpacked(self, data: bytes, need: int) -> bytes:
-        out = unpack(self.coding, data, need + 1)
-        if len(out) != need:
-            raise ValueError(f"a block of {len(out)} bytes where {need} are expected")
-        return out
