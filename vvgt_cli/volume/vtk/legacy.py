@@ -27,6 +27,9 @@ _TYPES = {
     "vtkidtype": "i4", "float": "f4", "double": "f8",
 }  # fmt: skip
 _FIXED = {"VECTORS": 3, "NORMALS": 3, "TENSORS": 9, "TENSORS6": 6, "GLOBAL_IDS": 1, "PEDIGREE_IDS": 1, "EDGE_FLAGS": 1}
+_PLACE = {  # of VTK's XML; "" is not read
+    "EXTENT": "WholeExtent", "ORIGIN": "Origin", "SPACING": "Spacing", "ASPECT_RATIO": "Spacing", "DIRECTION": "",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,7 @@ class Parser:
         """Begin at the start of ``text``."""
         self.text, self.path, self.position = text, path, 0
         self.arrays: list[_Array] = []
-        self.geometry: dict[str, list[str]] = {}
+        self.image: dict[str, str] = {}  # as VTK's XML has it
         self.where, self.tuples = "", 0
 
     def line(self) -> str | None:
@@ -94,8 +97,10 @@ class Parser:
 
     def section(self, key: str, words: list[str]) -> None:
         """Read one line that is a keyword, with the values that belong to it."""
-        if key in ("DIMENSIONS", "ORIGIN", "SPACING", "ASPECT_RATIO", "EXTENT", "DIRECTION"):
-            self.geometry["SPACING" if key == "ASPECT_RATIO" else key] = words[1:]
+        if key == "DIMENSIONS":
+            self.image.setdefault("WholeExtent", " ".join(f"0 {int(n) - 1}" for n in words[1:]))
+        elif key in _PLACE:
+            self.image[_PLACE[key]] = " ".join(words[1:])
         elif key in ("POINT_DATA", "CELL_DATA"):
             self.where, self.tuples = key[:-5].lower(), int(words[1])
         elif key == "METADATA":
@@ -207,14 +212,6 @@ def check_legacy_grid(path: Path) -> None:
         _Sections(text, path).parse()
 
 
-def _image(parser: Parser) -> dict[str, str]:
-    """Return extent, spacing and origin as VTK's XML has them."""
-    stated = {key: " ".join(words) for key, words in parser.geometry.items()}
-    dims = [int(n) for n in parser.geometry.get("DIMENSIONS", ())]
-    extent = stated.get("EXTENT", " ".join(f"0 {n - 1}" for n in dims))
-    return {"WholeExtent": extent} | {key.title(): stated[key] for key in ("SPACING", "ORIGIN") if key in stated}
-
-
 def read_legacy(path: Path, options: ReadOptions) -> Volume:
     """Read a legacy VTK image: point data, or cell data on the grid of cell centres."""
     with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
@@ -224,7 +221,7 @@ def read_legacy(path: Path, options: ReadOptions) -> Volume:
             array = parser.arrays[choose_array([a.info for a in parser.arrays], options.array, str(path))]
         if not binary or array.type == "bit":
             return IMAGE_BY_VTK(path, replace(options, array=array.info.name) if binary else options)
-        grid = image_grid(_image(parser), array.info.where, path)
+        grid = image_grid(parser.image, array.info.where, path)
     shape = (*reversed(grid.dims), array.info.components)
     if count(shape[:3]) != array.tuples:
         raise DataError(
