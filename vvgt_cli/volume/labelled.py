@@ -26,10 +26,7 @@ AXIS_ATTRIBUTES = ("axis", "standard_name", "units", "positive", "_CoordinateZis
 LIMITS = ("valid_min", "valid_max", "valid_range")
 MARKS = ("_FillValue", "missing_value", *LIMITS)
 NAMING = ("long_name", "standard_name", "units", "flag_values", "flag_meanings", "flag_masks")  # of the values
-CF_ATTRIBUTES = (
-    *("scale_factor", "add_offset", "_FillValue", "missing_value"),
-    *("valid_min", "valid_max", "valid_range", "_Unsigned"),
-)
+CF_ATTRIBUTES = ("scale_factor", "add_offset", *MARKS, "_Unsigned")
 DESCRIBES = ("bounds", "climatology", "cell_measures", "formula_terms", "ancillary_variables", "grid_mapping")
 GEOMETRY = (  # attributes that look like a place in space, in forms that no convention defines
     *("spacing", "voxel_size", "voxelSize", "pixel_size", "pixelSize", "resolution", "origin", "offset", "affine"),
