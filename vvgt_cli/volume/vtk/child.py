@@ -27,11 +27,10 @@ from vvgt_cli.volume.arrays.grib import GRIB, grib_volume
 from vvgt_cli.volume.blocks import fill
 from vvgt_cli.volume.readers import HDF5, HEAD_BYTES, volume_name
 from vvgt_cli.volume.reading import ArrayInfo, ReadOptions, Volume, check_memory, count
-from vvgt_cli.volume.vtk import GRIDS, IMAGE, INDEX, INDEXES, SINGLE, is_index, is_legacy, xml_kind
+from vvgt_cli.volume.vtk import GRIDS, IMAGE, INDEX, INDEXES, SINGLE, is_index, xml_kind
 from vvgt_cli.volume.vtk.grids import arrays_of, values_of
 from vvgt_cli.volume.vtk.index import PIECES, Index, files_of, read_index
 from vvgt_cli.volume.vtk.leaves import Leaf, arrays_in, leaves_of
-from vvgt_cli.volume.vtk.legacy import check_legacy_grid
 from vvgt_cli.volume.vtk.messages import checked, quiet_vtk
 from vvgt_cli.volume.vtk.programs import read_program
 from vvgt_cli.volume.vtk.resample import MAX_EDGE
@@ -315,8 +314,6 @@ def _reader(path: Path, kind: str | None, head: bytes) -> Any:
         scan(path)  # raises where the end of the file is missing
         return getattr(vtkIOXML, f"vtkXML{kind}Reader")()
     if head.startswith(b"# vtk DataFile"):
-        if is_legacy(head, grid=True):
-            check_legacy_grid(path)
         reader = vtkDataSetReader()
         for what in ("Scalars", "Vectors", "Normals", "Tensors", "ColorScalars", "TCoords", "Fields"):
             getattr(reader, f"ReadAll{what}On")()
