@@ -46,9 +46,9 @@ from vvgt_cli.network.training.scenes import as_float, prepare_scenes
 from vvgt_cli.progress import Console
 from vvgt_cli.refine import OptimizeOptions, optimize
 from vvgt_cli.splat import render
-from vvgt_cli.volume.medical.nrrd import write_nrrd
 from vvgt_cli.volume.shapes import make_shape, volume_of
 from vvgt_cli.volume.turbulence import TURNOVER, Solver, advance, fields, flow_of
+from vvgt_cli.volume.writers import write_nrrd
 
 GRID, SIZES = 64, (96, 128, 160)
 KINDS = ("shells", "tubes", "plates", "noise", "wells", "bodies", "bodies")  # the last twice, other seeds

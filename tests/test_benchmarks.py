@@ -13,7 +13,7 @@ from vvgt_cli.commands.main import run
 from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.network.card import find_model
 from vvgt_cli.volume import read_volume
-from vvgt_cli.volume.medical.nrrd import write_nrrd
+from vvgt_cli.volume.writers import write_nrrd
 
 pytestmark = pytest.mark.long
 ROOT = Path(__file__).parent.parent

@@ -5,9 +5,9 @@ import pytest
 
 from vvgt_cli.errors import UsageError
 from vvgt_cli.volume import read_volume
-from vvgt_cli.volume.medical.nrrd import write_nrrd
 from vvgt_cli.volume.shapes import SHAPES, make_shape
 from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.writers import write_nrrd
 
 
 @pytest.mark.parametrize("kind", SHAPES)

@@ -28,8 +28,8 @@ from vvgt_cli.network.training import scenes as training_scenes
 from vvgt_cli.network.training.scenes import make_scenes, prepare_scenes, recipes
 from vvgt_cli.progress import Console
 from vvgt_cli.splat import project, render, render_reference
-from vvgt_cli.volume.medical.nrrd import write_nrrd
 from vvgt_cli.volume.shapes import make_shape
+from vvgt_cli.volume.writers import write_nrrd
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("yaml")

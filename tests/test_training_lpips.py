@@ -18,8 +18,8 @@ from vvgt_cli.network.training import loop  # noqa: E402
 from vvgt_cli.network.training.lpips import load_lpips  # noqa: E402
 from vvgt_cli.network.training.sample import view_loss  # noqa: E402
 from vvgt_cli.progress import Console  # noqa: E402
-from vvgt_cli.volume.medical.nrrd import write_nrrd  # noqa: E402
 from vvgt_cli.volume.shapes import make_shape  # noqa: E402
+from vvgt_cli.volume.writers import write_nrrd  # noqa: E402
 
 CONVOLUTIONS = {0: 64, 2: 64, 5: 128, 7: 128, 10: 256, 12: 256, 14: 256, 17: 512, 19: 512, 21: 512, 24: 512, 26: 512,
                 28: 512}  # fmt: skip

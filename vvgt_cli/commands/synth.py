@@ -45,8 +45,8 @@ def synth(
     from vvgt_cli.gaussians.outputs import Output, claimed
     from vvgt_cli.library.inputs import console_of
     from vvgt_cli.score.record import ConversionReport, Run
-    from vvgt_cli.volume.medical.nrrd import write_nrrd
     from vvgt_cli.volume.shapes import SHAPES, make_shape
+    from vvgt_cli.volume.writers import write_nrrd
 
     shape, run = kind in SHAPES, Run(console_of(progress), ConversionReport("synth"))
     if shape and (field or turnovers is not None):

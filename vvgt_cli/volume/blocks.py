@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import bz2
 import gzip
+import lzma
 import math
 import mmap
 import warnings
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, cast
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from vvgt_cli.resources import free_memory
 # The most that each coding can expand: deflate 258 bytes from 2 bits, bzip2 about 900 kB from some 40 bytes.
 MAX_RATIO = {"gzip": 1040, "zlib": 1040, "bzip2": 25000}
 SHARE = 0.25  # of the free memory: what takes less is decompressed at once
+LZMA_MEMORY = 1 << 28  # bytes of a dictionary: the strongest preset needs a quarter, a damaged header says gigabytes
 _CHUNK = 1 << 20
 
 
@@ -82,6 +84,23 @@ _OPENERS: dict[str, Callable[[IO[bytes]], Any]] = {
 }
 
 
+_ENGINES: dict[str, Callable[[], Any]] = {
+    "gzip": lambda: zlib.decompressobj(31),
+    "zlib": zlib.decompressobj,
+    "bzip2": bz2.BZ2Decompressor,
+    "xz": lambda: lzma.LZMADecompressor(memlimit=LZMA_MEMORY),
+}
+
+
+def unpack(coding: str, data: bytes | memoryview, most: int) -> bytes:
+    """Unpack at most ``most`` bytes of ``gzip``, ``zlib``, ``bzip2``, ``xz`` or one block of ``lz4``."""
+    if coding == "lz4":
+        import lz4.block
+
+        return bytes(lz4.block.decompress(data, uncompressed_size=most))
+    return bytes(_ENGINES[coding]().decompress(data, most))
+
+
 def read_head(path: Path, size: int) -> tuple[bytes, str]:
     """Return the first bytes of a file, decompressed, and ``raw``, ``gzip`` or ``bzip2``, or raise DataError."""
     with open(path, "rb") as file:
@@ -134,9 +153,7 @@ def load_block(
             f"{size_text(need + skip)} that its header declares; check the header's sizes and type"
         )
     if packed and len(shape) == 3 and is_large(need):
-        left: Any = Packed(path, dtype, shape, encoding, (offset, skip))
-        result: np.ndarray = left
-        return result
+        return cast(np.ndarray, Packed(path, dtype, shape, encoding, (offset, skip)))
     return _decompressed(path, dtype, shape, offset, encoding, skip)
 
 
@@ -251,35 +268,25 @@ def fill(stream: Any, need: int) -> tuple[np.ndarray, int]:
     return out, filled
 
 
-def tokens(text: bytes | mmap.mmap, start: int, n: int, name: str) -> Iterator[tuple[list[bytes], int]]:
-    """Yield ``n`` white-space separated words of ``text`` from ``start`` on, by windows: (words, position behind them).
+def parse_numbers(text: bytes | mmap.mmap, start: int, n: int, dtype: np.dtype, name: str) -> np.ndarray:
+    """Parse ``n`` numbers between white space from ``start`` on, (n,) native, window by window.
 
-    Raise DataError if there are fewer.
+    Raise DataError if there are fewer, or others.
     """
-    missing, position = n, start
-    while missing:
+    native = dtype.newbyteorder("=")
+    check_memory(n * native.itemsize, name, AS_NUMBERS)
+    values, filled, position = np.empty(n, native), 0, start
+    while filled < n:
         window = text[position : position + _CHUNK]
         if not window:
-            raise DataError(f"{name}: the text holds {n - missing} values, expected {n}; check that the file is whole")
+            raise DataError(f"{name}: the text holds {filled} values, expected {n}; check that the file is whole")
         if position + len(window) < len(text):
             cut = max(window.rfind(c) for c in (b" ", b"\n", b"\t", b"\r"))
             window = window[: cut + 1] or window
         if isinstance(text, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
             text.madvise(mmap.MADV_DONTNEED)  # its pages are not read again
-        words = window.split(None, missing)
         position += len(window)
-        if len(words) > missing:
-            position -= len(words.pop())
-        missing -= len(words)
-        yield words, position
-
-
-def parse_numbers(text: bytes | mmap.mmap, start: int, n: int, dtype: np.dtype, name: str) -> np.ndarray:
-    """Parse ``n`` numbers of text from ``start`` on, (n,) native; raise DataError if there are fewer, or others."""
-    native = dtype.newbyteorder("=")
-    check_memory(n * native.itemsize, name, AS_NUMBERS)
-    values, filled = np.empty(n, native), 0
-    for words, _ in tokens(text, start, n, name):
+        words = window.split(None, n - filled)[: n - filled]
         try:
             values[filled : filled + len(words)] = np.array(words, dtype="S").astype(native)
         except (ValueError, OverflowError) as error:

@@ -38,8 +38,7 @@ def without_other_bodies(volume: Volume, above: float) -> Volume:
         kept = largest(matter)
         share = 100 * (1 - np.count_nonzero(kept) / count)
         warnings.warn(f"{what}: hides {share:.3g} % of the voxels above it, in smaller bodies", stacklevel=2)
-        mask: np.ndarray = (kept | ~matter).astype(np.uint8)
-        return mask
+        return np.asarray(kept | ~matter, np.uint8)
 
     data: Any = Stored(lambda at: whole()[at], np.dtype(np.uint8), volume.data.shape, chunks_of(volume), volume.name)
     return Volume(data, name=volume.name)
@@ -63,5 +62,4 @@ def largest(mask: np.ndarray) -> np.ndarray:
     bodies.SetLabelConstantValue(1)
     bodies.SetLabelScalarTypeToUnsignedChar()
     bodies.Update()
-    inside: np.ndarray = vtk_to_numpy(bodies.GetOutput().GetPointData().GetScalars()).reshape(mask.shape) > 0
-    return inside
+    return np.asarray(vtk_to_numpy(bodies.GetOutput().GetPointData().GetScalars()).reshape(mask.shape) > 0)

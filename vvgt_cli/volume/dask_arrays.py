@@ -66,18 +66,25 @@ class Chunks:
             for ends, (a, b) in zip(self._ends, spans, strict=True)
         ]
         missing = []
+
+        def put(number: Number, chunk: np.ndarray) -> None:
+            at = [ends[k] for ends, k in zip(self._ends, number, strict=True)]
+            put_overlap(out, [a for a, _ in spans], chunk, at)
+
         for number in itertools.product(*touched):
             if number in self._kept:
                 self._kept.move_to_end(number)
-                self._put(out, spans, number, self._kept[number])
+                put(number, self._kept[number])
             else:
                 missing.append(number)
         one = math.prod(self.largest) * self._array.dtype.itemsize
         at_once = max(AT_ONCE // max(one, 1), 1)
         for k in range(0, len(missing), at_once):
             for number, chunk in self._computed(missing[k : k + at_once]):
-                self._put(out, spans, number, chunk)
-                self._keep(number, chunk)
+                put(number, chunk)
+                self._kept[number] = chunk  # and those used longest ago are let go of
+                while len(self._kept) > 1 and sum(kept.nbytes for kept in self._kept.values()) > self._room:
+                    self._kept.popitem(last=False)
         return out[tuple(slice(None) if isinstance(i, slice) else 0 for i in index)]
 
     def _computed(self, numbers: list[Number]) -> list[tuple[Number, np.ndarray]]:
@@ -101,14 +108,3 @@ class Chunks:
                 )
             chunks.append((number, chunk))
         return chunks
-
-    def _put(self, out: np.ndarray, spans: list[tuple[int, int]], number: Number, chunk: np.ndarray) -> None:
-        """Copy the part of a chunk that lies in the box of ``spans``."""
-        at = [ends[k] for ends, k in zip(self._ends, number, strict=True)]
-        put_overlap(out, [a for a, _ in spans], chunk, at)
-
-    def _keep(self, number: Number, chunk: np.ndarray) -> None:
-        """Keep a chunk, and let go of those that were used longest ago."""
-        self._kept[number] = chunk
-        while len(self._kept) > 1 and sum(kept.nbytes for kept in self._kept.values()) > self._room:
-            self._kept.popitem(last=False)

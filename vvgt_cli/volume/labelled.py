@@ -17,33 +17,22 @@ import numpy as np
 from vvgt_cli.errors import DataError, SeveralComponents, SeveralSteps, UsageError
 from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory
 from vvgt_cli.volume.components import contiguous, listed, select_component
-from vvgt_cli.volume.reading import (
-    ReadOptions,
-    Segment,
-    Stored,
-    Volume,
-    float_dtype,
-    printable,
-    segments_in,
-    text_of,
-    triple,
-)
+from vvgt_cli.volume.reading import ReadOptions, Segment, Volume, float_dtype, printable, segments_in, text_of, triple
 from vvgt_cli.volume.space import metres, unit_name
+from vvgt_cli.volume.stored import Stored
 
 EVEN = 0.01  # of a step that a coordinate may be off and still count as evenly spaced (float32 longitudes are)
 AXIS_ATTRIBUTES = ("axis", "standard_name", "units", "positive", "_CoordinateZisPositive")
 LIMITS = ("valid_min", "valid_max", "valid_range")
 MARKS = ("_FillValue", "missing_value", *LIMITS)
 NAMING = ("long_name", "standard_name", "units", "flag_values", "flag_meanings", "flag_masks")  # of the values
-CF_ATTRIBUTES = (
-    *("scale_factor", "add_offset", "_FillValue", "missing_value"),
-    *("valid_min", "valid_max", "valid_range", "_Unsigned"),
-)
+CF_ATTRIBUTES = ("scale_factor", "add_offset", *MARKS, "_Unsigned")
 DESCRIBES = ("bounds", "climatology", "cell_measures", "formula_terms", "ancillary_variables", "grid_mapping")
 GEOMETRY = (  # attributes that look like a place in space, in forms that no convention defines
     *("spacing", "voxel_size", "voxelSize", "pixel_size", "pixelSize", "resolution", "origin", "offset", "affine"),
     *("direction", "transform"),
 )
+ATTRIBUTES = (*CF_ATTRIBUTES, *GEOMETRY, *NAMING)
 _ROLES = {
     "x": {"x", "lon", "longitude", "rlon", "easting", "projection_x_coordinate", "grid_longitude"},
     "y": {"y", "lat", "latitude", "rlat", "northing", "projection_y_coordinate", "grid_latitude"},
@@ -144,7 +133,7 @@ def _points_down(stated: Mapping[str, str], words: Sequence[str], centres: np.nd
 
 def described_by(attributes: Mapping[str, Any]) -> list[str]:
     """Return the names of variables that describe one of these attributes, and are no data of their own (CF, 7)."""
-    words = (word for key in DESCRIBES for word in str(attributes.get(key, "")).split())
+    words = (word for key in DESCRIBES for word in text_of(attributes.get(key, "")).split())
     return [word for word in words if not word.endswith(":")]
 
 

@@ -33,8 +33,7 @@ def _field(rng: np.random.Generator, size: int, slope: float, finest: float = np
     k = np.sqrt(half[None, None, :] ** 2 + line[None, :, None] ** 2 + line[:, None, None] ** 2)
     spectrum *= np.where((k > 0) & (k <= finest), np.maximum(k, 1) ** -slope, 0)
     field = np.fft.irfftn(spectrum, s=(size,) * 3, axes=(0, 1, 2))
-    result: np.ndarray = field / field.std()
-    return result
+    return np.asarray(field / field.std())
 
 
 def _rotation(rng: np.random.Generator) -> np.ndarray:
@@ -116,8 +115,7 @@ def noise(size: int, seed: int) -> np.ndarray:
     """Return noise of all scales over [0, 1], from clouds to granite depending on the seed."""
     rng = np.random.default_rng(seed)
     field = _field(rng, size, rng.uniform(1.6, 2.6), size / 3)
-    result: np.ndarray = (field - field.min()) / (field.max() - field.min())
-    return result
+    return np.asarray((field - field.min()) / (field.max() - field.min()))
 
 
 def wells(size: int, seed: int) -> np.ndarray:
@@ -129,8 +127,7 @@ def wells(size: int, seed: int) -> np.ndarray:
         place, width = rng.uniform(-0.7, 0.7, 3), np.exp(rng.uniform(np.log(0.06), np.log(0.3)))
         x, y, z = (np.exp(-0.5 * ((line - p) / width) ** 2) for p in place)
         field += rng.choice([-0.5, 1.0]) * rng.uniform(0.3, 1) * z[:, None, None] * y[None, :, None] * x[None, None, :]
-    result: np.ndarray = (field - field.min()) / (field.max() - field.min())
-    return result
+    return np.asarray((field - field.min()) / (field.max() - field.min()))
 
 
 def bodies(size: int, seed: int) -> np.ndarray:

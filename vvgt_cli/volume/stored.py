@@ -188,12 +188,11 @@ def values_at(volume: Volume, index: np.ndarray) -> np.ndarray:
     values = np.empty(len(index))
     if not len(index):
         return values
-    edge = np.array([max(c, POINTS_BOX) for c in chunks_of(volume)[::-1]]) if isinstance(volume.data, Stored) else None
-    if edge is None:
+    if not isinstance(volume.data, Stored):
         x, y, z = index.T
-        stored: np.ndarray = volume.data[z, y, x]
-        values[:] = stored
+        values[:] = volume.data[z, y, x]
         return volume.slope * values + volume.intercept
+    edge = np.array([max(c, POINTS_BOX) for c in chunks_of(volume)[::-1]])
     boxes, which = np.unique(index // edge, axis=0, return_inverse=True)
     order = np.argsort(which.ravel(), kind="stable")
     for box, rows in zip(boxes, np.split(order, np.cumsum(np.bincount(which.ravel()))[:-1]), strict=True):

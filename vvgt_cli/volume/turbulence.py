@@ -84,8 +84,7 @@ class Solver:
 
     def project(self, modes: np.ndarray) -> np.ndarray:
         """Return the divergence-free part of modes (3, ...)."""
-        result: np.ndarray = modes - self.k * ((self.k * modes).sum(axis=0) * self.over_k2)
-        return result
+        return np.asarray(modes - self.k * ((self.k * modes).sum(axis=0) * self.over_k2))
 
     def curl(self, u: np.ndarray) -> np.ndarray:
         """Return the modes of the vorticity."""
@@ -126,8 +125,7 @@ class Solver:
         b = self.slope(half * (state + dt / 2 * a))
         c = self.slope(half * state + dt / 2 * b)
         d = self.slope(half * (half * state + dt * c))
-        result: np.ndarray = half * (half * (state + dt / 6 * a) + dt / 3 * (b + c)) + dt / 6 * d
-        return result
+        return np.asarray(half * (half * (state + dt / 6 * a) + dt / 3 * (b + c)) + dt / 6 * d)
 
     def courant_step(self, state: np.ndarray) -> float:
         """Return the largest dt that the fastest particle and the fastest wave allow."""

@@ -21,7 +21,6 @@ from vvgt_cli.errors import UsageError
 from vvgt_cli.files import atomic_write, check_disk_space
 from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.libraries import need
-from vvgt_cli.volume.medical.nrrd import nrrd_header
 from vvgt_cli.volume.space import in_space
 from vvgt_cli.volume.types import RIGHT, Volume
 
@@ -101,6 +100,16 @@ def write_volume(path: str | os.PathLike[str], planes: Planes, overwrite: bool =
         return temporary.stat().st_size
 
 
+def write_nrrd(path: str | os.PathLike[str], volume: Volume, overwrite: bool = False) -> int:
+    """Write a volume's data values as float32 under a name that ends in .nrrd, as `write_volume`."""
+
+    def make(z: range) -> np.ndarray:
+        values = volume.data[z.start : z.stop].astype(np.float32)
+        return np.asarray(values * np.float32(volume.slope) + np.float32(volume.intercept))
+
+    return write_volume(path, Planes(volume, np.dtype(np.float32), 1, make), overwrite)
+
+
 def _nifti(planes: Planes, name: str) -> tuple[bytes, bytes]:
     nib, grid = need("nibabel", "neuro", name, "a NIfTI file"), planes.grid
     placed = grid if grid.space is None else in_space(grid, "RAS")
@@ -120,7 +129,25 @@ def _nifti(planes: Planes, name: str) -> tuple[bytes, bytes]:
 
 
 def _nrrd(planes: Planes, _: str) -> tuple[bytes, bytes]:
-    return nrrd_header(planes.grid, _NAMES[planes.dtype.str[1:]][0], planes.components), b""
+    volume, components, several = planes.grid, planes.components, planes.components > 1
+    vectors = " ".join(
+        f"({','.join(repr(v) if v else '0' for v in axis)})" for axis in volume.affine[:3, :3].T.tolist()
+    )
+    space = {"RAS": "right-anterior-superior", "LPS": "left-posterior-superior"}.get(volume.space or "")
+    header = [
+        "NRRD0004",
+        f"type: {_NAMES[planes.dtype.str[1:]][0]}",
+        f"dimension: {3 + several}",
+        f"space: {space}" if space else "space dimension: 3",
+        f"sizes: {f'{components} ' * several}{' '.join(map(str, volume.dims))}",
+        f"space directions: {'none ' * several}{vectors}",
+        f"space origin: ({','.join(repr(float(o)) for o in volume.origin)})",
+        *(["kinds: vector domain domain domain"] if several else []),
+        *([f"space units: {' '.join([chr(34) + volume.unit + chr(34)] * 3)}"] if volume.unit and not space else []),
+        "endian: little",
+        "encoding: raw",
+    ]
+    return ("\n".join(header) + "\n\n").encode(), b""
 
 
 def _meta(planes: Planes, _: str) -> tuple[bytes, bytes]:

@@ -52,20 +52,21 @@ def conventional_axes(file: Any, dataset: Any, source: str) -> tuple[list[Axis],
     elif "axistags" in dataset.attrs:
         axes = _vigra(json.loads(text_of(dataset.attrs["axistags"])).get("axes", []), dataset)
     elif np.size(sizes) == 3 and len(dataset.shape) >= 3:
-        *outer, nz, ny, nx = dataset.shape
-        axes = [Axis("", n) for n in outer]
-        for name, n, step in zip("zyx", (nz, ny, nx), np.ravel(sizes).astype(np.float64), strict=True):
-            axes.append(even_axis(name, n, 0.0, step, {"units": "um"}))
+        steps = np.ravel(sizes).astype(np.float64)
+        axes = [*(Axis("", n) for n in dataset.shape[:-3]), *_even("zyx", dataset.shape[-3:], 0 * steps, steps, "um")]
     return (axes, more) if axes else None
+
+
+def _even(names: Sequence[str], sizes: Sequence[int], first: Any, steps: Any, unit: str = "") -> list[Axis]:
+    """Return even axes from their first coordinates and steps."""
+    stated = {"units": unit} if unit else {}
+    return [even_axis(*one, stated) for one in zip(names, sizes, first, steps, strict=False)]
 
 
 def _itk(group: Any, dataset: Any) -> list[Axis]:
     """Return the axes of an image of ITK (HDF5ImageIO), whose facts are in the order x, y, z."""
     steps, first = (np.ravel(group[key])[::-1] for key in ("Spacing", "Origin"))
-    spatial = [
-        even_axis(name, size, *place)
-        for name, size, *place in zip("tzyx"[-len(steps) :], dataset.shape, first, steps, strict=False)
-    ]
+    spatial = _even("tzyx"[-len(steps) :], dataset.shape, first, steps)
     return [*spatial, *(Axis("components", n, role="c") for n in dataset.shape[len(steps) :])]
 
 
@@ -99,10 +100,7 @@ def _openpmd(dataset: Any, source: str) -> tuple[list[Axis], dict[str, Any]]:
     spacing, offset, position, unit = (np.broadcast_to(one.astype(np.float64), n) for one in numbers)
     order = slice(None, None, -1 if text_of(mesh.get("dataOrder", "C")) == "F" else 1)
     step, start = (spacing * unit)[order], ((offset + position * spacing) * unit)[order]
-    axes = [
-        even_axis(label, size, first, each, {"units": "m"})
-        for label, size, first, each in zip(labels[order], dataset.shape, start, step, strict=True)
-    ]
+    axes = _even(labels[order], dataset.shape, start, step, "m")
     return axes, {"scale_factor": dataset.attrs["unitSI"]} if "unitSI" in dataset.attrs else {}
 
 
@@ -127,9 +125,8 @@ def _bigdataviewer(setup: Any, level: int, dataset: Any) -> tuple[list[Axis], di
 
     Without the setup's attribute ``dataType``, int16 stands for uint16 (bigdataviewer-core, ``Hdf5ImageLoader``).
     """
-    axes = []
-    for name, size, factor in zip("zyx", dataset.shape, setup["resolutions"][level][::-1], strict=True):
-        axes.append(even_axis(name, size, (factor - 1) / 2, factor))
+    factors = setup["resolutions"][level][::-1]
+    axes = _even("zyx", dataset.shape, (factors - 1) / 2, factors)
     unsigned = text_of(setup.attrs.get("dataType", "uint16")).startswith("uint")
     return axes, {"_Unsigned": "true"} if unsigned else {}
 
@@ -158,10 +155,7 @@ def _nexus_scaling(group: Any, name: str) -> dict[str, Any]:
 def _dream3d(geometry: Any, dataset: Any) -> list[Axis]:
     """Return the axes of cells of DREAM.3D, whose origin is a corner; spacing and origin are in the order x, y, z."""
     steps, first = (np.ravel(geometry[key])[::-1] for key in ("SPACING", "ORIGIN"))
-    spatial = [
-        even_axis(name, size, start + step / 2, step)
-        for name, size, start, step in zip("zyx", dataset.shape, first, steps, strict=False)
-    ]
+    spatial = _even("zyx", dataset.shape, first + steps / 2, steps)
     return [*spatial, *(Axis("components", n, None, "", "c") for n in dataset.shape[3:])]
 
 

@@ -19,17 +19,7 @@ from vvgt_cli.volume.arrays import MAX_CHUNK
 from vvgt_cli.volume.arrays.beside import GROUPS, Neighbour, choose_grid, with_neighbours
 from vvgt_cli.volume.arrays.conventions import conventional_axes, coordinates_of, turned_by_itk
 from vvgt_cli.volume.blocks import data_file, load_block, size_text
-from vvgt_cli.volume.labelled import (
-    CF_ATTRIBUTES,
-    DESCRIBES,
-    GEOMETRY,
-    NAMING,
-    Axis,
-    axis,
-    described_by,
-    flags_of,
-    labelled_volume,
-)
+from vvgt_cli.volume.labelled import ATTRIBUTES, GEOMETRY, Axis, axis, described_by, flags_of, labelled_volume
 from vvgt_cli.volume.libraries import need, read_part
 from vvgt_cli.volume.microscopy import bigdataviewer
 from vvgt_cli.volume.microscopy.imaris import is_imaris, read_imaris
@@ -62,7 +52,7 @@ def read_dataset(path: Path, options: ReadOptions) -> Volume:
         mapped = _mapped(dataset, path)
         stored = mapped if mapped is not None else lambda index: dataset[index]
         name = f"{volume_name(path)}:{dataset.name.strip('/')}"
-        attributes = {key: dataset.attrs[key] for key in (*CF_ATTRIBUTES, *GEOMETRY, *NAMING) if key in dataset.attrs}
+        attributes = {key: dataset.attrs[key] for key in ATTRIBUTES if key in dataset.attrs}
         attributes |= {key: up.attrs[key] for up in (file, dataset.parent) for key in GEOMETRY if key in up.attrs}
         axes = scaled_axes(dataset)
         if not any(a.name or a.centres is not None for a in axes):
@@ -116,7 +106,7 @@ def datasets(h5py: Any, group: Any) -> list[Any]:
     def visit(name: str, item: Any) -> bool | None:
         nonlocal seen
         seen += 1
-        described.update(described_by({key: text_of(item.attrs[key]) for key in DESCRIBES if key in item.attrs}))
+        described.update(described_by(item.attrs))
         numbers = isinstance(item, h5py.Dataset) and item.dtype.kind in "iufb"
         text = numbers and item.dtype == np.uint8 and name.endswith("Metadata")  # of Velox
         if numbers and not text and 1 <= len(item.shape or ()) <= 5:

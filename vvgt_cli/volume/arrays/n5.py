@@ -7,13 +7,10 @@ n5-viewer, BigDataViewer and COSEM.
 
 from __future__ import annotations
 
-import bz2
 import itertools
-import lzma
 import math
 import re
 import struct
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.volume import blocks
 from vvgt_cli.volume.arrays import MAX_CHUNK
 from vvgt_cli.volume.arrays.beside import choose_grid
 from vvgt_cli.volume.arrays.zarr import inside, json_object, name_in
@@ -90,12 +88,8 @@ def unpack(compression: dict[str, Any], data: bytes, size: int, source: str) -> 
     kind = compression.get("type", "raw")
     if kind == "raw":
         return data[:size]
-    if kind == "gzip":
-        return zlib.decompressobj(15 if compression.get("useZlib") is True else 31).decompress(data, size)
-    if kind == "bzip2":
-        return bz2.BZ2Decompressor().decompress(data, size)
-    if kind == "xz":
-        return lzma.LZMADecompressor(memlimit=256 << 20).decompress(data, size)
+    if kind in ("gzip", "bzip2", "xz"):
+        return blocks.unpack("zlib" if kind == "gzip" and compression.get("useZlib") is True else kind, data, size)
     if kind == "lz4":
         return _lz4(data, size)
     if kind in ("blosc", "zstd"):
@@ -110,8 +104,6 @@ def unpack(compression: dict[str, Any], data: bytes, size: int, source: str) -> 
 
 
 def _lz4(data: bytes, size: int) -> bytes:
-    import lz4.block
-
     out, at = bytearray(), 0
     while len(out) < size:
         magic, token, packed, length, _ = LZ4_BLOCK.unpack_from(data, at)
@@ -119,7 +111,7 @@ def _lz4(data: bytes, size: int) -> bytes:
         if magic != b"LZ4Block" or not 0 < length <= size - len(out) or not 0 <= packed <= len(data) - at:
             raise ValueError("an LZ4 block that does not fit")
         part = data[at : at + packed]
-        out += part if token & 0xF0 == 0x10 else lz4.block.decompress(part, uncompressed_size=length)
+        out += part if token & 0xF0 == 0x10 else blocks.unpack("lz4", part, length)
         at += packed
     return bytes(out)
 

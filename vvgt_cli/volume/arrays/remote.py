@@ -143,8 +143,9 @@ class Remote:
         return BytesIO(self._content or b"")
 
 
-def _opened(url: str, options: ReadOptions) -> tuple[Path, ReadOptions]:
-    """Return the store at an address, as `read_zarr` takes paths, and options with the part behind ``:/`` as array."""
+def read_scheme(scheme: str, rest: str, options: ReadOptions) -> Volume:
+    """Read one array at the address ``scheme:rest``, chunk by chunk where the options leave it stored."""
+    url = f"{scheme}:{rest}"
     head, _, inner = url.rpartition(":/")
     if head in SCHEMES:
         head, inner = url, ""
@@ -155,12 +156,7 @@ def _opened(url: str, options: ReadOptions) -> tuple[Path, ReadOptions]:
         raise DataError(
             f"{url}: no Zarr there, or no answer (of another format download the file); expected .../x.ome.zarr"
         )
-    return place, replace(options, array=inner or options.array)
-
-
-def read_scheme(scheme: str, rest: str, options: ReadOptions) -> Volume:
-    """Read one array at the address ``scheme:rest``, chunk by chunk where the options leave it stored."""
-    return read_zarr(*_opened(f"{scheme}:{rest}", options))
+    return read_zarr(place, replace(options, array=inner or options.array))
 
 
 class _Zipped(Remote):

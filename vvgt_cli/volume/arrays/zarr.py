@@ -137,10 +137,8 @@ def _metadata(folder: Path) -> dict[str, Any]:
     for name in _METADATA:
         file = folder / name
         if file.is_file():
-            facts = json_object(file)
-            if name == ".zarray":
-                return {"node_type": "array", **facts}
-            return {"node_type": "group", **facts} if name == ".zgroup" else facts
+            kind = {".zarray": {"node_type": "array"}, ".zgroup": {"node_type": "group"}}.get(name, {})
+            return kind | json_object(file)
     return {}
 
 
@@ -206,13 +204,6 @@ def _check_codecs(place: Path, facts: dict[str, Any]) -> None:
             raise DataError(f"{place}: codec {name!r}; expected one of {', '.join(sorted(_CODECS))}")
 
 
-def _attributes(folder: Path) -> dict[str, Any]:
-    """Read the attributes of a node of either version."""
-    old = folder / ".zattrs"
-    attributes = json_object(old) if old.is_file() else _metadata(folder).get("attributes")
-    return attributes if isinstance(attributes, dict) else {}
-
-
 def _beside(zarr: Any, path: Path, place: Path, names: Sequence[str]) -> dict[str, Neighbour]:
     """List the arrays along one axis beside another: those of some names alone where a server lists no folders."""
 
@@ -234,7 +225,9 @@ def _beside(zarr: Any, path: Path, place: Path, names: Sequence[str]) -> dict[st
 
 def _ome(group: Path) -> dict[str, Any]:
     """Return the attributes of a group that OME-Zarr defines; from version 0.5 on they lie in ``ome``."""
-    attributes = _attributes(group)
+    old = group / ".zattrs"
+    attributes = json_object(old) if old.is_file() else _metadata(group).get("attributes")
+    attributes = attributes if isinstance(attributes, dict) else {}
     inner = attributes.get("ome")
     return inner if isinstance(inner, dict) else attributes
 

@@ -19,7 +19,7 @@ import numpy as np
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.dicom.pet import in_suv
 from vvgt_cli.volume.dicom.segmentation import is_segmentation, names_of, read_segmentation
-from vvgt_cli.volume.dicom.series import Files, Source, choose_series, headers_in, one_stack, read_file
+from vvgt_cli.volume.dicom.series import Source, choose_series, headers_in, is_of, one_stack, read_file
 from vvgt_cli.volume.dicom.volumes import ATTRIBUTES, one_volume
 from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, need, printable, select_component
 
@@ -90,11 +90,17 @@ def read_dicom(path: Path, options: ReadOptions) -> Volume:
     """
     need("pydicom", "dicom", str(path), "DICOM")
     title, chosen, rest = choose_series(headers_in(path), options.array, path)
-    if is_segmentation(chosen[0][1]):
-        return _segmentation(path, chosen, options)
+    file, header = chosen[0]
+    if is_segmentation(header):
+        if path.is_dir():
+            raise DataError(
+                f"{path}: a segmentation (DICOM SEG) of {names_of(header)}; give its file, {file}, or the images that "
+                "it was made on"
+            )
+        return read_segmentation(path, options)
     number, _, name = rest.partition("/")
     name, stack = (name, int(number)) if number.isdecimal() else (rest, None)
-    mosaic = next((_mosaic(file) for file, header in chosen if _is_mosaic(header)), None)
+    mosaic = next((_mosaic(file) for file, header in chosen if is_of("MOSAIC", header)), None)
     slices = [s for file, header in chosen for s in _frames(file, header, mosaic, options)]
     slices = one_volume(one_stack(slices, _alike, stack, title, path), options, name, path)
     slices, unit = _in_real_world(slices, path)
@@ -128,20 +134,6 @@ def _resampled(volume: Volume, heights: np.ndarray, options: ReadOptions, path: 
     origin = tuple((np.array(volume.origin) + volume.axes @ np.array(sampled.origin)).tolist())
     place: dict[str, Any] = {"spacing": sampled.spacing, "origin": origin, "slope": 1.0, "intercept": 0.0}
     return replace(volume, data=sampled.data, name=sampled.name, **place)
-
-
-def _segmentation(path: Path, chosen: Files, options: ReadOptions) -> Volume:
-    """Read the label map of a file; of a folder the error names the file, whose own table goes with it."""
-    if path.is_dir():
-        raise DataError(
-            f"{path}: a segmentation (DICOM SEG) of {names_of(chosen[0][1])}; give its file, {chosen[0][0]}, or the "
-            "images that it was made on"
-        )
-    return read_segmentation(path, options)
-
-
-def _is_mosaic(header: Any) -> bool:
-    return "MOSAIC" in [str(word).upper() for word in header.get("ImageType") or []]
 
 
 def _mosaic(source: Source) -> tuple[int, np.ndarray | None]:
@@ -179,7 +171,7 @@ def _frames(
     for k in range(n):
         frame = _frame(source, header, [g for g in (per_frame[k] if per_frame else None, shared) if g is not None], k,
                        options, stacked)  # fmt: skip
-        if not stacked and mosaic is not None and _is_mosaic(header):
+        if not stacked and mosaic is not None and is_of("MOSAIC", header):
             yield from _tiles(frame, *mosaic)
         else:
             yield frame

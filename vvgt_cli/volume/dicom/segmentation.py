@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, SeveralComponents, UsageError
-from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, library_errors, listed, need, triple
+from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, library_errors, listed, need, placed, triple
 from vvgt_cli.volume.segments import Segment, segments_in
 
 CLASSES = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")  # Segmentation, Label Map Segmentation
@@ -115,7 +115,11 @@ def read_segmentation(path: Path, options: ReadOptions) -> Volume:
         raise DataError(f"{source}: planes that are no even stack; expected a segmentation of a volume")
     numbers = sorted(number for number in read.segment_numbers if number)
     check_memory(2 * math.prod(grid.spatial_shape), source)
-    chosen = _chosen(numbers, options.component, source)
+    component, chosen = options.component, numbers
+    if component is not None:
+        if component not in range(len(numbers)):
+            raise UsageError(f"{source}: no segment {component}; expected --component 0 to {len(numbers) - 1}")
+        chosen = [numbers[int(component)]]
     try:
         combined = read.get_volume(segment_numbers=chosen, combine_segments=True)
     except RuntimeError as error:
@@ -126,20 +130,9 @@ def read_segmentation(path: Path, options: ReadOptions) -> Volume:
             f"{len(numbers) - 1}",
             len(numbers),
         ) from None
-    steps = combined.affine[:3, 2::-1]  # of column, row and slice
-    spacing = np.linalg.norm(steps, axis=0)
+    steps = combined.affine[:3, 2::-1].T  # of column, row and slice
     own = segments_in(lambda: [one for one in segments(source) if one.number in chosen], source)
-    return Volume(
-        np.ascontiguousarray(combined.array), options.spacing_or((spacing[0], spacing[1], spacing[2])),
-        tuple(combined.affine[:3, 3].tolist()), tuple((steps / spacing).ravel().tolist()),
-        path.resolve().name.removesuffix(".dcm"), space="LPS", reference=str(read.FrameOfReferenceUID),
-        segments=own,
+    return placed(
+        np.ascontiguousarray(combined.array), steps, combined.affine[:3, 3], options,
+        path.resolve().name.removesuffix(".dcm"), space="LPS", reference=str(read.FrameOfReferenceUID), segments=own,
     )  # fmt: skip
-
-
-def _chosen(numbers: list[int], component: int | str | None, source: str) -> list[int]:
-    if component is None:
-        return numbers
-    if component not in range(len(numbers)):
-        raise UsageError(f"{source}: no segment {component}; expected --component 0 to {len(numbers) - 1}")
-    return [numbers[int(component)]]

@@ -3,8 +3,7 @@
 Localisers (scouts), segmentations and single images of another orientation are skipped where one stack remains, and a
 warning says so; where several remain, the error lists them.
 
-Files of a folder or a zip archive are found by content: one begins with a preamble and ``DICM`` (PS3.10, 7.1), or, as
-older programs wrote it, with the data set itself.
+Files of a folder or a zip archive are found by content (`vvgt_cli.volume.dicom.is_dicom`).
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from vvgt_cli.errors import DataError, SeveralArrays, UsageError
 from vvgt_cli.volume.dicom import is_dicom
 from vvgt_cli.volume.dicom.pet import TAGS as PET
 from vvgt_cli.volume.dicom.segmentation import is_segmentation
-from vvgt_cli.volume.dicom.volumes import ATTRIBUTES
+from vvgt_cli.volume.dicom.volumes import ATTRIBUTES, FEW
 from vvgt_cli.volume.microscopy.image import Bounded
 from vvgt_cli.volume.reading import check_memory, listed, printable
 
@@ -132,7 +131,7 @@ def _headers(path: Path, _states: tuple[tuple[int, int], ...]) -> list[tuple[Sou
     return list(unique.values())
 
 
-_FEW = 2  # slices: fewer than make a stack, beside one that has more
+LOCALISER = "LOCALIZER"
 _SPACE = ("sagittal", "coronal", "axial")
 
 _PLACES = ("ImagePositionPatient", "PerFrameFunctionalGroupsSequence", "DetectorInformationSequence")
@@ -182,7 +181,7 @@ def _only(series: dict[str, Files], path: Path) -> Files:
     aside = {
         uid: files
         for uid, files in series.items()
-        if all(_localiser(h) or is_segmentation(h) or not any(key in h for key in _PLACES) for _, h in files)
+        if all(is_of(LOCALISER, h) or is_segmentation(h) or not any(key in h for key in _PLACES) for _, h in files)
     }
     left = {uid: f for uid, f in series.items() if uid not in aside} or series
     if len(left) > 1:
@@ -220,14 +219,15 @@ def _listed(series: dict[str, Files]) -> str:
     return listed(parts)
 
 
-def _localiser(header: Any) -> bool:
-    return "LOCALIZER" in [str(word).upper() for word in header.get("ImageType") or []]
+def is_of(kind: str, header: Any) -> bool:
+    """Tell whether images are of a kind, a word of their Image Type."""
+    return kind in [str(word).upper() for word in header.get("ImageType") or []]
 
 
 def one_stack(
     slices: list[Any], alike: Callable[[Any, Any], bool], number: int | None, title: str, path: Path
 ) -> list[Any]:
-    """Return the slices of one size and orientation: the stack asked for, or the only one of more than `_FEW` slices.
+    """Return the slices of one size and orientation: the stack asked for, or the only one of more than `FEW` slices.
 
     ``alike`` tells whether two slices may lie in one stack; ``number`` counts stacks from 1. Raise SeveralArrays or
     UsageError where it does not choose one.
@@ -248,8 +248,8 @@ def one_stack(
         return stacks[number - 1]
     if len(stacks) == 1:
         return stacks[0]
-    real = [stack for stack in stacks if not all(_localiser(s.header) for s in stack)] or stacks
-    large = [stack for stack in real if len(stack) > _FEW] if len(real) > 1 else real
+    real = [stack for stack in stacks if not all(is_of(LOCALISER, s.header) for s in stack)] or stacks
+    large = [stack for stack in real if len(stack) > FEW] if len(real) > 1 else real
     if len(large) != 1:
         raise SeveralArrays(
             f"{path}: slices that differ in size, orientation or pixel spacing: {listing}; choose one with --series "
@@ -264,6 +264,6 @@ def _of(stack: list[Any]) -> str:
     first = stack[0]
     normal = np.abs(np.cross(first.rows[0], first.rows[1]))
     plane = _SPACE[int(normal.argmax())] if normal.max() > 0.95 else "oblique"
-    scout = ", localiser" if _localiser(first.header) else ""
+    scout = ", localiser" if is_of(LOCALISER, first.header) else ""
     size = f"{first.header.get('Columns')} x {first.header.get('Rows')}"
     return f"{len(stack)} {plane} slice{'s' * (len(stack) != 1)} of {size}{scout}"

@@ -18,7 +18,7 @@ import numpy as np
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.reading import ReadOptions, listed, printable
 
-FEW = 2  # slices: fewer than make a volume, beside one that has more
+FEW = 2  # slices: fewer than make a volume or a stack, beside one that has more
 NEAR = 0.01  # share of the largest distance of neighbouring slices within which two are in one place
 ATTRIBUTES = {  # by which volumes of a series differ: unit, and where functional groups have it
     "EchoTime": ("ms", "MREchoSequence", "EffectiveEchoTime"),

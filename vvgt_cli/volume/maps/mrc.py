@@ -117,8 +117,7 @@ def _steps(intervals: tuple[int, ...], cell: tuple[float, ...], angles: tuple[fl
     if up <= FLAT**2:
         return np.diag(lengths)
     unit = np.array([[1.0, 0.0, 0.0], [c, sine, 0.0], [b, across, math.sqrt(up)]])
-    result: np.ndarray = unit * np.array(lengths)[:, None]
-    return result
+    return np.asarray(unit * np.array(lengths)[:, None])
 
 
 def read_mrc(path: Path, options: ReadOptions) -> Volume:

@@ -18,7 +18,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.components import listed, select_component
-from vvgt_cli.volume.reading import DENSITY, ReadOptions, Volume, load_block, placed, type_of, volume_name
+from vvgt_cli.volume.reading import DENSITY, HeaderFields, ReadOptions, Volume, load_block, placed, type_of, volume_name
 
 BOHR = 0.529177210903  # angstroms (CODATA 2018)
 LINE, LINES = 4096, 100_000  # bytes of a line of a header, and lines
@@ -35,13 +35,7 @@ def _words(file: IO[bytes], path: Path, what: str) -> list[str]:
 
 def _floats(words: list[str], n: int, path: Path, what: str) -> list[float]:
     """Parse the first ``n`` finite numbers of a line; raise DataError for others."""
-    try:
-        numbers = [float(w) for w in words[:n]]
-    except ValueError:
-        numbers = []
-    if len(numbers) < n or not all(map(math.isfinite, numbers)):
-        raise DataError(f"{path}: {what} is {' '.join(words)[:80]!r}; expected {n} finite numbers")
-    return numbers
+    return HeaderFields(str(path)).floats(what, " ".join(words[:n]), n)
 
 
 def _whole(words: list[str], path: Path, what: str) -> int:
@@ -205,5 +199,4 @@ def _vasp_cell(file: IO[bytes], path: Path) -> np.ndarray:
     selective = "".join(_words(file, path, "the kind of coordinates")).lower().startswith("s")
     for _ in range(min(atoms, MAX_ATOMS) + selective):
         _words(file, path, "an atom")
-    result: np.ndarray = cell * scale
-    return result
+    return np.asarray(cell * scale)

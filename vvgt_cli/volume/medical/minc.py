@@ -70,20 +70,19 @@ def _minc1(path: Path) -> _Image:
     values = image.mapped(path)
     if min(values.shape, default=0) > 0 and dtype.kind in "iu":
         values = values.view(dtype.newbyteorder(">"))
+
+    def read(index: tuple[Any, ...]) -> np.ndarray:
+        part = np.array(values[index])
+        give_back(values)
+        return part
+
     ends = [variables[name] for name in ("image-min", "image-max") if name in variables]
     limits = [(v.dims, v.mapped(path).reshape(v.shape)) for v in ends]
     axes = {name: variables[name].attributes for name in image.dims if name in variables}
     return _Image(
-        image.dims, image.shape, dtype, partial(_mapped_part, values), image.attributes,
+        image.dims, image.shape, dtype, read, image.attributes,
         _ends(limits, image.dims, image.shape, path), axes,
     )  # fmt: skip
-
-
-def _mapped_part(values: np.ndarray, index: tuple[Any, ...]) -> np.ndarray:
-    """Copy a part of a map, and give its pages back."""
-    part = np.array(values[index])
-    give_back(values)
-    return part
 
 
 def _minc2(path: Path) -> _Image:

@@ -47,11 +47,10 @@ class Header:
     pixdim: tuple[float, ...]
     qform: tuple[float, ...] | None = None
     sform: tuple[float, ...] | None = None
-    unit: float = 1.0  # mm
+    unit: float = 0.0  # in mm; 0 unknown
     samples: int = 0  # bytes of a voxel that is a colour
     start: float = 0.0  # of time, in its unit
     time_unit: str = ""  # where the header states one
-    unit_known: bool = False  # of lengths
 
 
 def parse_header(head: bytes, name: str) -> Header:
@@ -96,11 +95,10 @@ def parse_header(head: bytes, name: str) -> Header:
         pixdim,
         quatern if q_code > 0 else None,
         sform if s_code > 0 else None,
-        {1: 1e3, 3: 1e-3}.get(units & 7, 1.0),  # metres, micrometres
+        {1: 1e3, 2: 1.0, 3: 1e-3}.get(units & 7, 0.0),  # metres, millimetres, micrometres
         _COLORS.get(code, 0),
         start,
         {8: "s", 16: "ms", 24: "us"}.get(units & 0x38, ""),
-        units & 7 in (1, 2, 3),
     )
 
 
@@ -116,21 +114,18 @@ def _scaling(slope: float, intercept: float, name: str) -> tuple[float, float]:
 def _place(header: Header) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], str | None]:
     """Return spacing, direction (row-major), origin and space: sform, else qform, else pixdim (nifti1.h, 3, 2, 1).
 
-    A form that is not finite, or whose axes lie in a plane, is ignored. With pixdim alone no space is known.
+    Lengths are in the file's unit. A form that is not finite, or whose axes lie in a plane, is ignored. With pixdim
+    alone no space is known.
     """
     steps = tuple(abs(p) for p in header.pixdim[1:4])
     if header.sform is not None and all(map(math.isfinite, header.sform)):
         matrix = np.reshape(header.sform, (3, 4))
         lengths, direction = unit_rows(matrix[:, :3].T)
         if min(lengths) > 0 and abs(np.linalg.det(np.reshape(direction, (3, 3)))) > FLAT:
-            return _in_mm(header, lengths), direction, _in_mm(header, matrix[:, 3].tolist()), "RAS"
+            return lengths, direction, tuple(matrix[:, 3].tolist()), "RAS"
     if header.qform is not None and all(map(math.isfinite, header.qform)):
-        return _in_mm(header, steps), _rotation(header.qform, header.pixdim[0]), _in_mm(header, header.qform[3:]), "RAS"
-    return _in_mm(header, steps), IDENTITY, (0.0, 0.0, 0.0), None
-
-
-def _in_mm(header: Header, lengths: tuple[float, ...]) -> tuple[float, ...]:
-    return tuple(header.unit * length for length in lengths)
+        return steps, _rotation(header.qform, header.pixdim[0]), header.qform[3:], "RAS"
+    return steps, IDENTITY, (0.0, 0.0, 0.0), None
 
 
 def _rotation(qform: tuple[float, ...], qfac: float) -> tuple[float, ...]:
@@ -198,9 +193,10 @@ def _volume(header: Header, path: Path, encoding: str, options: ReadOptions) -> 
         if header.time_unit:
             frames = replace(frames, start=header.start, step=header.pixdim[4], unit=header.time_unit)
         field, (slope, intercept) = load_frames(frames, options, str(path))
-    spacing, direction, origin, space = _place(header)
-    steps = tuple(s if n > 1 or s else 1.0 for s, n in zip(spacing, reversed(field.shape), strict=True))
-    unit = "mm" if header.unit_known else ""
+    spacing, direction, first, space = _place(header)
+    unit, mm = "mm" if header.unit else "", header.unit or 1.0
+    steps = tuple(mm * s if n > 1 or s else 1.0 for s, n in zip(spacing, reversed(field.shape), strict=True))
+    origin = tuple(mm * o for o in first)
     return Volume(
         field, options.spacing_or(steps), origin, direction, volume_name(path), slope, intercept, space, unit=unit
     )

@@ -10,7 +10,6 @@ Format: https://teem.sourceforge.net/nrrd/format.html
 from __future__ import annotations
 
 import math
-import os
 import re
 import warnings
 from collections.abc import Callable
@@ -20,7 +19,6 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.files import atomic_write
 from vvgt_cli.volume.blocks import Packed, check_memory, count, data_file, load_block
 from vvgt_cli.volume.headers import MARK, MAX_HEADER, HeaderFields, printable
 from vvgt_cli.volume.reading import ReadOptions, Segment, Volume, segments_in, select_component, triple, volume_name
@@ -190,8 +188,7 @@ def _third(axes: list[list[float]]) -> np.ndarray:
     unit = np.reshape(unit_rows([*axes, [0.0, 0.0, 1.0]])[1], (3, 3)).T
     normal = np.cross(unit[0], unit[1])
     length = np.linalg.norm(normal)
-    result: np.ndarray = normal / length if length > 0 else unit[2]
-    return result
+    return np.asarray(normal / length if length > 0 else unit[2])
 
 
 def _space(fields: HeaderFields) -> tuple[np.ndarray, str | None]:
@@ -264,18 +261,16 @@ def _volume(path: Path, fields: HeaderFields, block: np.ndarray, sizes: list[int
     block = block[..., None] if axis is None else np.moveaxis(block, len(sizes) - 1 - axis, -1)
     if block.ndim == 3:
         block = block[None]
-    color = "rgb" in fields.get("kinds", "").lower()
     label = f"axis {axis}" if axis is not None else ""
-    component = options.component
-    kinds = fields.get("kinds", "").lower().split()
-    kind = kinds[axis] if axis is not None and axis < len(kinds) else ""
+    component, kinds = options.component, fields.get("kinds", "").lower()
+    kind = dict(enumerate(kinds.split())).get(axis, "") if axis is not None else ""
     if kind == "time" or (kind == "list" and _SEQUENCE.search(path.name)):
         component = _step(block, options, str(path))
     elif options.time:
         raise UsageError(
             f"{path}: no axis of time (of kind time, or list in a .seq.nrrd); leave out --time {options.time}"
         )
-    field, _ = select_component(block, component, str(path), label=label, color=color)
+    field, _ = select_component(block, component, str(path), label=label, color="rgb" in kinds)
     return placed(field, **place)
 
 
@@ -363,37 +358,3 @@ def _load_files(
     for k, name in enumerate(names):
         out[k] = load(name, part)
     return out.reshape(shape)
-
-
-def write_nrrd(path: str | os.PathLike[str], volume: Volume, overwrite: bool = False) -> int:
-    """Write data values as float32 into an attached raw file, and return its size in bytes.
-
-    Errors are those of `atomic_write`.
-    """
-    values = np.ascontiguousarray(volume.data, "<f4") * np.float32(volume.slope) + np.float32(volume.intercept)
-    with atomic_write(path, overwrite) as temporary:
-        temporary.write_bytes(nrrd_header(volume, "float") + values.astype("<f4", copy=False).tobytes())
-    return Path(path).stat().st_size
-
-
-def nrrd_header(volume: Volume, kind: str, components: int = 1) -> bytes:
-    """Return the header, and the blank line behind it, of raw little-endian values of type ``kind``."""
-    several = components > 1
-    vectors = " ".join(
-        f"({','.join(repr(v) if v else '0' for v in axis)})" for axis in volume.affine[:3, :3].T.tolist()
-    )
-    space = {"RAS": "right-anterior-superior", "LPS": "left-posterior-superior"}.get(volume.space or "")
-    header = [
-        "NRRD0004",
-        f"type: {kind}",
-        f"dimension: {3 + several}",
-        f"space: {space}" if space else "space dimension: 3",
-        f"sizes: {f'{components} ' * several}{' '.join(map(str, volume.dims))}",
-        f"space directions: {'none ' * several}{vectors}",
-        f"space origin: ({','.join(repr(float(o)) for o in volume.origin)})",
-        *(["kinds: vector domain domain domain"] if several else []),
-        *([f"space units: {' '.join([chr(34) + volume.unit + chr(34)] * 3)}"] if volume.unit and not space else []),
-        "endian: little",
-        "encoding: raw",
-    ]
-    return ("\n".join(header) + "\n\n").encode()

@@ -18,8 +18,9 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError, VvgtError
+from vvgt_cli.volume.blocks import read_head
 from vvgt_cli.volume.microscopy.image import MAX_XML, choose_channel, choose_image, safe_xml
-from vvgt_cli.volume.readers import lazy
+from vvgt_cli.volume.readers import HEAD_BYTES, lazy
 from vvgt_cli.volume.reading import ReadOptions, Volume, magnitude, need, printable
 from vvgt_cli.volume.space import metres, placed, unit_name
 from vvgt_cli.volume.stored import loaded
@@ -104,13 +105,6 @@ def read_beside(path: Path, options: ReadOptions) -> Volume | None:
     return None if bdv is None else _read(bdv, options)
 
 
-def _is_xml(path: Path) -> bool:
-    if not path.is_file():
-        return False
-    with open(path, "rb") as file:
-        return b"<SpimData" in file.read(4096)
-
-
 def _of_data(path: Path, tell: bool) -> _Dataset | None:
     """Return what the XML beside data says, else the views that they hold; None of data that have another layout."""
     if path.is_dir():
@@ -124,7 +118,8 @@ def _of_data(path: Path, tell: bool) -> _Dataset | None:
     if not views:
         return None
     for xml in sorted(path.resolve().parent.glob("*.xml")):
-        if _is_xml(xml) and (bdv := _described(xml)).data.resolve() == path.resolve():
+        mine = xml.is_file() and b"<SpimData" in read_head(xml, HEAD_BYTES)[0]
+        if mine and (bdv := _described(xml)).data.resolve() == path.resolve():
             return replace(bdv, source=path)
     if tell:
         warnings.warn(

@@ -6,7 +6,6 @@ Format: Imaris 5.5 file format, https://imaris.oxinst.com/support/imaris-file-fo
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,11 +31,11 @@ def read_imaris(file: Any, path: Path, options: ReadOptions, checked: Callable[[
     """
     if options.array is not None:
         raise UsageError(f"{path}: an Imaris file, which has one image; leave out --array {options.array}")
-    levels, level = _count(file, "ResolutionLevel"), options.level or 0
+    levels, level = _count(file["DataSet"], "ResolutionLevel"), options.level or 0
     if level >= levels:
         raise UsageError(f"{path}: --level {level}: expected full, or 0 to {levels - 1}")
-    times = _count(file[f"DataSet/ResolutionLevel {level}"], "TimePoint", "")
-    channels = _count(file[f"DataSet/ResolutionLevel {level}/TimePoint 0"], "Channel", "")
+    times = _count(file[f"DataSet/ResolutionLevel {level}"], "TimePoint")
+    channels = _count(file[f"DataSet/ResolutionLevel {level}/TimePoint 0"], "Channel")
     first = checked(_place(level, 0, 0))
     shape = _shape(file, level)
     for time in range(times) if options.time is None else [min(options.time, times - 1)]:
@@ -47,11 +46,13 @@ def read_imaris(file: Any, path: Path, options: ReadOptions, checked: Callable[[
                 raise DataError(f"{path}:/{name}: {dataset.shape}; expected at least the image's {shape}")
     image = file["DataSetInfo/Image"].attrs if "DataSetInfo/Image" in file else {}
     spacing, origin = _placed(image, shape)
-    channel_facts = [_channel(file, c) for c in range(channels)]
-    picture = Micrograph(
-        times, channels, shape, first.dtype, partial(_read, path, level), first.chunks or (1, *shape[1:]), spacing,
-        origin, [name for name, _ in channel_facts], [color for _, color in channel_facts],
-    )  # fmt: skip
+    names, colors = zip(*(_channel(file, c) for c in range(channels)), strict=True)
+
+    def read(time: int, channel: int, box: Slices) -> np.ndarray:  # datasets are padded to whole chunks
+        return read_part(path, _place(level, time, channel), box)
+
+    chunks = first.chunks or (1, *shape[1:])
+    picture = Micrograph(times, channels, shape, first.dtype, read, chunks, spacing, origin, names, colors)
     return picture_volume(picture, options, str(path), volume_name(path))
 
 
@@ -59,14 +60,8 @@ def _place(level: int, time: int, channel: int) -> str:
     return f"DataSet/ResolutionLevel {level}/TimePoint {time}/Channel {channel}/Data"
 
 
-def _read(path: Path, level: int, time: int, channel: int, box: Slices) -> np.ndarray:
-    """Read a box; datasets are padded to whole chunks."""
-    return read_part(path, _place(level, time, channel), box)
-
-
-def _count(group: Any, what: str, inside: str = "DataSet") -> int:
+def _count(group: Any, what: str) -> int:
     """Count the groups ``what 0``, ``what 1``, ... in a row."""
-    group = group[inside] if inside else group
     return next(k for k in range(MAX_COUNT) if f"{what} {k}" not in group)
 
 

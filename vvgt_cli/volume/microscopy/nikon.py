@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import struct
-import zlib
 from functools import cache
 from pathlib import Path
 from threading import Lock
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
+from vvgt_cli.volume.blocks import unpack
 from vvgt_cli.volume.microscopy.image import EXTRA, Bounded, Color, Micrograph, choose_image, picture_volume
 from vvgt_cli.volume.reading import ReadOptions, Slices, Volume, library_errors, need, volume_name
 
@@ -131,7 +131,7 @@ def _reader(
             file.seek(where[number])
             _, title, length = CHUNK.unpack(file.read(CHUNK.size))
             file.seek(title + 8, 1)  # the name and the time
-            values = np.frombuffer(zlib.decompressobj().decompress(file.read(length - 8), size), dtype)
+            values = np.frombuffer(unpack("zlib", file.read(length - 8), size), dtype)
         rows = values.reshape(sizes["Y"], -1)[:, : sizes["X"] * sizes.get("C", 1) * samples]
         return rows.reshape(sizes["Y"], sizes["X"], sizes.get("C", 1), samples).transpose(2, 0, 1, 3)
 

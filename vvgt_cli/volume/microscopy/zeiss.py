@@ -35,6 +35,7 @@ from vvgt_cli.volume.microscopy.image import (
 )
 from vvgt_cli.volume.reading import ReadOptions, Slices, Volume, need, volume_name
 from vvgt_cli.volume.space import MICROMETRE
+from vvgt_cli.volume.stored import put_overlap
 
 SEGMENT = struct.Struct("<16sqq")  # name, bytes set aside, bytes used
 HEADER = struct.Struct("<iiii16s16siqqiq")  # the 8th and 9th: where directory and metadata are
@@ -257,15 +258,12 @@ def _read(
     z, y, x = box
     number, sample = divmod(channel, samples)
     sample = 2 - sample if sample < 3 and samples > 1 else sample
-    out = np.zeros([k.stop - k.start for k in box], dtype)
+    out, first = np.zeros([k.stop - k.start for k in box], dtype), [k.start for k in box]
     for k in range(z.start, z.stop):
         for tile in planes.get((time, number, k), ()):
             left, top = tile.x - corner[0], tile.y - corner[1]
-            x0, x1 = max(left, x.start), min(left + tile.width, x.stop)
-            y0, y1 = max(top, y.start), min(top + tile.height, y.stop)
-            if x0 < x1 and y0 < y1:
-                pixels = pixels_of(tile, path)[y0 - top : y1 - top, x0 - left : x1 - left, sample]
-                out[k - z.start, y0 - y.start : y1 - y.start, x0 - x.start : x1 - x.start] = pixels
+            if x.start - tile.width < left < x.stop and y.start - tile.height < top < y.stop:
+                put_overlap(out, first, pixels_of(tile, path)[None, ..., sample], (k, top, left))
     return out
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
+from vvgt_cli.volume.blocks import unpack
 
 ZIP, ACTIVE_MASK, BLOSC = 1, 2, 4
 _LZ4 = 1
@@ -36,12 +37,10 @@ def read_block(cursor: Cursor, need: int, compression: int) -> bytes | memoryvie
 
 
 def _unzip(data: memoryview, need: int, cursor: Cursor) -> bytes:
-    engine = zlib.decompressobj()
     try:
-        out = engine.decompress(data, need + 1)
+        return unpack("zlib", data, need + 1)
     except zlib.error as error:
         raise cursor.bad(f"damaged ZIP data ({error})") from error
-    return out
 
 
 def _unblosc(data: memoryview, need: int, cursor: Cursor) -> bytes:

@@ -1,7 +1,5 @@
 """OpenVDB ``.vdb``, format versions 222 to 225: the active bounding box of one grid, bit for bit as OpenVDB reads it.
 
-Read here because no wheel of OpenVDB exists; its own Python module, where a system has it, reads fewer types.
-
 A tree's active bounding box is kept as those 8^3 bricks that vary (leaves, as they are), beside one value for every
 other brick (tiles). Its slabs are put together when they are asked for, or all of it once, in memory that takes no page
 where all is zero.
@@ -65,10 +63,8 @@ def read_tree(cursor: Cursor, grids: list[Grid], grid: Grid) -> Tree:
         owner = next((g for g in grids if not g.parent and g.unique == grid.parent), None)
         if owner is None or owner.kind != grid.kind:
             raise DataError(f"{cursor.name}: grid {grid} shares the tree of {grid.parent!r}, which is not in the file")
-        cursor.seek(owner.start)
         grid = owner
-    else:
-        cursor.seek(grid.start)
+    cursor.seek(grid.start)
     compression, half, _ = read_grid_head(cursor)
     return TreeReader(cursor, grid.kind, grid.half or half, compression).read()
 
@@ -149,9 +145,9 @@ def brick_array(
     bricks = tree.leaves
     if not tail:
         fill, bricks = fill[..., None], bricks[..., None]
-    fill = _choose(fill, component, source, label)
-    cubes = bricks.reshape(-1, EDGE, EDGE, *bricks.shape[4:])
-    bricks = _choose(cubes, component, source, label).reshape(-1, EDGE, EDGE, EDGE)
+    fill, _ = select_component(fill, component, source, label=label)
+    cubes, _ = select_component(bricks.reshape(-1, EDGE, EDGE, *bricks.shape[4:]), component, source, label=label)
+    bricks = cubes.reshape(-1, EDGE, EDGE, EDGE)
     z0, y0, x0 = (int(v) for v in (lo - first * EDGE)[::-1])
 
     @lru_cache(maxsize=1)  # as slabs are thinner than bricks
@@ -195,10 +191,6 @@ def laid_out(values: Stored) -> np.ndarray:
         out[z : z + EDGE][rows] = slab[rows]
     out.flags.writeable = False
     return out
-
-
-def _choose(values: np.ndarray, component: int | str | None, source: str, label: str) -> np.ndarray:
-    return select_component(values, component, source, label=label)[0]
 
 
 def _paint(fill: np.ndarray, node: Node, first: np.ndarray, background: np.ndarray) -> None:

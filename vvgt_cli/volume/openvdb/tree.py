@@ -125,8 +125,7 @@ class TreeReader:
     def numbers(self, data: bytes | memoryview, dtype: np.dtype) -> np.ndarray:
         """Convert bytes to values in native order and full precision."""
         if dtype.kind == "b":
-            result: np.ndarray = np.frombuffer(data, np.uint8) != 0
-            return result
+            return np.asarray(np.frombuffer(data, np.uint8) != 0)
         return np.frombuffer(data, dtype).astype(self.dtype.newbyteorder("="))
 
     def bits(self, n: int) -> np.ndarray:

@@ -14,7 +14,7 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import data_file, load_block
 from vvgt_cli.volume.headers import MAX_HEADER, HeaderFields, type_of
-from vvgt_cli.volume.reading import IDENTITY, ReadOptions, Volume, select_component, unit_rows, volume_name
+from vvgt_cli.volume.reading import ReadOptions, Volume, placed, select_component, volume_name
 
 
 def _fields(path: Path) -> HeaderFields:
@@ -49,18 +49,17 @@ def _scaling(fields: HeaderFields) -> tuple[float, float]:
     return slope, v0 - slope * d0
 
 
-def _geometry(fields: HeaderFields, dims: list[int]) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return spacing (x, y, z) and direction (row-major).
+def _vectors(fields: HeaderFields, dims: list[int]) -> np.ndarray:
+    """Return the vectors of a step along x, y and z, one a row.
 
     Basis vectors are rows of the matrix whose columns span the whole box: so Inviwo's DatVolumeSequenceReader takes
     them and its DatVolumeWriter writes them.
     """
     keys = ("basisvector1", "basisvector2", "basisvector3")
     if all(fields.get(k) for k in keys):
-        lengths, direction = unit_rows(np.transpose([fields.floats(k, fields[k], 3) for k in keys]))
-        return tuple(length / n for length, n in zip(lengths, dims, strict=True)), direction
+        return np.asarray(np.transpose([fields.floats(k, fields[k], 3) for k in keys]) / np.reshape(dims, (3, 1)))
     sizes = next((fields.floats(k, fields[k], 3) for k in ("spacing", "slicethickness") if fields.get(k)), [1.0] * 3)
-    return tuple(sizes), IDENTITY
+    return np.diag(np.abs(sizes))
 
 
 def read_inviwo(path: Path, options: ReadOptions) -> Volume:
@@ -81,11 +80,8 @@ def read_inviwo(path: Path, options: ReadOptions) -> Volume:
     block = load_block(source, dtype, (steps, *reversed(dims), channels), offset=offset)
     block = np.moveaxis(block, 0, -1).reshape(*reversed(dims), -1) if steps > 1 else block[0]
     field, (slope, intercept) = select_component(block, options.component, str(path), scaling=_scaling(fields))
-    spacing, direction = _geometry(fields, dims)
-    name = volume_name(path)
-    volume = Volume(
-        field, options.spacing_or(spacing), direction=direction, name=name, slope=slope, intercept=intercept
-    )
+    vectors, facts = _vectors(fields, dims), {"slope": slope, "intercept": intercept}
+    volume = placed(field, vectors, (0.0, 0.0, 0.0), options, volume_name(path), **facts)
     edges = volume.affine[:3, :3]
     if fields.get("offset"):
         origin = np.array(fields.floats("Offset", fields["offset"], 3)) + edges @ (0.5, 0.5, 0.5)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import lzma
 import math
 import os
-import zlib
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -13,15 +11,11 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
+from vvgt_cli.volume.blocks import unpack
 
 # of OpenImageIO: none, CCITT, LZW, JPEG, deflate, PackBits
 _CODINGS = {1, 2, 3, 4, 5, 7, 8, 32773, 32946}
-LZMA_MEMORY = 128 << 20  # bytes: the strongest preset's dictionary needs half of it, a damaged header says gigabytes
-_ENGINES: dict[int, Any] = {
-    8: zlib.decompressobj,
-    32946: zlib.decompressobj,
-    34925: lambda: lzma.LZMADecompressor(memlimit=LZMA_MEMORY),
-}
+_PACKED = {8: "zlib", 32946: "zlib", 34925: "xz"}  # codings of `blocks.unpack`
 _WHITE_IS_ZERO, _PALETTE = 0, 3
 
 
@@ -92,8 +86,7 @@ class Pages(ExitStack):
                 )
             pixels = image.read_image(page.index, 0, 0, spec.nchannels, spec.format)
             if pixels is not None:
-                result: np.ndarray = pixels.reshape(expected)
-                return result
+                return np.asarray(pixels.reshape(expected))
         text = _one_line(image.geterror())
         if keyframe.compression in _CODINGS:
             raise DataError(f"{self._path}: page {page.index} is damaged ({text})")
@@ -117,8 +110,7 @@ class Pages(ExitStack):
                 f"{self._path}: page {page.index} has {values.size} values of {values.dtype} when decoded; expected "
                 f"{keyframe.size} of {series.dtype}"
             )
-        result: np.ndarray = values
-        return result
+        return np.asarray(values)
 
     def _check_segments(self, page: Any, keyframe: Any) -> None:
         """Refuse pages that lack parts, parts beyond the file, and parts that unpack to more than the page.
@@ -128,8 +120,8 @@ class Pages(ExitStack):
         parts = math.prod(page.chunked)
         if len(page.dataoffsets) != parts:
             raise DataError(f"{self._path}: page {page.index} has {len(page.dataoffsets)} parts; expected {parts}")
-        make = _ENGINES.get(int(keyframe.compression))
-        if make is None:
+        coding = _PACKED.get(int(keyframe.compression))
+        if coding is None:
             return
         with open(page.parent.filehandle.path, "rb") as file:
             end = file.seek(0, os.SEEK_END)
@@ -139,7 +131,7 @@ class Pages(ExitStack):
                         f"{self._path}: page {page.index} has a part of {n} bytes at {offset}; the file ends at {end}"
                     )
                 file.seek(offset)
-                if len(make().decompress(file.read(n), keyframe.nbytes + 1)) > keyframe.nbytes:
+                if len(unpack(coding, file.read(n), keyframe.nbytes + 1)) > keyframe.nbytes:
                     raise DataError(f"{self._path}: page {page.index} unpacks to more than its {keyframe.nbytes} bytes")
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
@@ -17,18 +16,6 @@ MAX_PAGES = 1 << 20
 _MAX_RATIO = 1 << 15  # fax codes blank pages in next to nothing; deflate is at 1032
 
 
-@dataclass(frozen=True)
-class _Layout:
-    """A file being walked: its byte order, the forms of a directory's parts, and its size."""
-
-    path: Path
-    order: str
-    number: str
-    entry: str
-    link: str
-    size: int
-
-
 def check_pages(path: Path) -> int:
     """Count the pages of a file; raise DataError unless its directories, tags and pixels fit into it."""
     try:
@@ -39,50 +26,44 @@ def check_pages(path: Path) -> int:
 
 
 def _walk(file: BinaryIO, path: Path) -> int:
-    head = file.read(16)
+    head, size = file.read(16), path.stat().st_size
     order = "<" if head[:2] == b"II" else ">"
     (version,) = struct.unpack_from(order + "H", head, 2)
     big = version == 43
     (offset,) = struct.unpack_from(order + ("Q" if big else "I"), head, 8 if big else 4)
     forms = ("Q", "HHQ8s", "Q") if big else ("H", "HHI4s", "I")
-    layout = _Layout(path, order, *forms, path.stat().st_size)
+    number, entry, link = (struct.Struct(order + form) for form in forms)
     seen: set[int] = set()
     least = 0
     while offset:
         if offset in seen or len(seen) >= MAX_PAGES:
             raise DataError(f"{path}: page {len(seen)} of the TIFF file points back to an earlier one")
-        seen.add(offset)
         file.seek(offset)
-        (n,) = struct.unpack(order + layout.number, file.read(struct.calcsize(layout.number)))
-        step = struct.calcsize("<" + layout.entry)
-        least += _page_bytes(file.read(min(n, 4096) * step), layout, len(seen) - 1)
-        file.seek(offset + struct.calcsize(layout.number) + n * step)
-        (offset,) = struct.unpack(order + layout.link, file.read(struct.calcsize(layout.link)))
+        (n,) = number.unpack(file.read(number.size))
+        rows = list(entry.iter_unpack(file.read(min(n, 4096) * entry.size)))
+        least += _page_bytes(rows, order, size, f"{path}: page {len(seen)}")
+        seen.add(offset)
+        file.seek(offset + number.size + n * entry.size)
+        (offset,) = link.unpack(file.read(link.size))
     if not seen:
         raise DataError(f"{path}: a TIFF file without pages")
-    if least > layout.size * _MAX_RATIO:
-        raise DataError(f"{path}: {size_text(layout.size)} cannot hold its {len(seen)} pages of {size_text(least)}")
+    if least > size * _MAX_RATIO:
+        raise DataError(f"{path}: {size_text(size)} cannot hold its {len(seen)} pages of {size_text(least)}")
     return len(seen)
 
 
-def _page_bytes(table: bytes, layout: _Layout, page: int) -> int:
-    """Return the least number of bytes that the pixels of a page take."""
+def _page_bytes(rows: list[tuple[int, int, int, bytes]], order: str, size: int, page: str) -> int:
+    """Return the least number of bytes that the pixels of a page take, by its tags, in a file of ``size`` bytes."""
     tags: dict[int, int] = {}
-    step = struct.calcsize("<" + layout.entry)
-    for at in range(0, len(table) - step + 1, step):
-        tag, kind, n, value = struct.unpack_from(layout.order + layout.entry, table, at)
-        if n * _BYTES.get(kind, 1) > layout.size:
-            raise DataError(
-                f"{layout.path}: page {page}: {n} values of tag {tag} in a file of {size_text(layout.size)}"
-            )
+    for tag, kind, n, value in rows:
+        if n * _BYTES.get(kind, 1) > size:
+            raise DataError(f"{page}: {n} values of tag {tag} in a file of {size_text(size)}")
         if kind in _FIELD and n:
-            tags[tag] = struct.unpack_from(layout.order + _FIELD[kind], value)[0]
+            tags[tag] = struct.unpack_from(order + _FIELD[kind], value)[0]
     samples = tags.get(_SAMPLES, 1)
     # BitsPerSample lies elsewhere in the file when there are several: 8 is the least that matters for a size check.
     bits = tags.get(_BITS, 1) if samples <= 2 else 8
     width, height = tags.get(_WIDTH, 0), tags.get(_HEIGHT, 0)
     if min(width, height, samples) < 1:
-        raise DataError(
-            f"{layout.path}: page {page} of {width} x {height} pixels with {samples} samples; expected at least 1"
-        )
+        raise DataError(f"{page} of {width} x {height} pixels with {samples} samples; expected at least 1")
     return width * height * samples * max(tags.get(_DEPTH, 1), 1) * max(bits, 1) // 8

@@ -29,6 +29,7 @@ import numpy as np
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.microscopy.image import Micrograph, choose_image, picture_volume
 from vvgt_cli.volume.reading import ReadOptions, Slices, Volume, metres, printable, size_text, triple, volume_name
+from vvgt_cli.volume.space import MICROMETRE
 from vvgt_cli.volume.tiff.decode import Pages
 from vvgt_cli.volume.tiff.ome import ome_tag, open_tiff
 from vvgt_cli.volume.tiff.pages import check_pages
@@ -267,7 +268,6 @@ def _whole(series: Any, path: Path) -> None:
         )
 
 
-MICROMETRE = 1e-6  # metres
 _OTHER_NAMES = {"A": "angstrom", "in": "inch", "inches": "inch", "pixels": "pixel"}
 _PER = {2: "inch", 3: "cm"}  # ResolutionUnit, tag 296
 

@@ -24,15 +24,15 @@ import numpy as np
 from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, SeveralSteps, UsageError, VvgtError
 from vvgt_cli.resources import free_memory
 from vvgt_cli.volume.arrays.grib import GRIB, grib_volume
+from vvgt_cli.volume.blocks import fill
 from vvgt_cli.volume.readers import HDF5, HEAD_BYTES, volume_name
 from vvgt_cli.volume.reading import ArrayInfo, ReadOptions, Volume, check_memory, count
-from vvgt_cli.volume.vtk import GRIDS, IMAGE, INDEX, INDEXES, SINGLE, is_index, is_legacy, xml_kind
+from vvgt_cli.volume.vtk import GRIDS, IMAGE, INDEX, INDEXES, SINGLE, is_index, xml_kind
 from vvgt_cli.volume.vtk.grids import arrays_of, values_of
 from vvgt_cli.volume.vtk.index import PIECES, Index, files_of, read_index
 from vvgt_cli.volume.vtk.leaves import Leaf, arrays_in, leaves_of
-from vvgt_cli.volume.vtk.legacy import check_legacy_grid
 from vvgt_cli.volume.vtk.messages import checked, quiet_vtk
-from vvgt_cli.volume.vtk.programs import PROGRAMS, read_program
+from vvgt_cli.volume.vtk.programs import read_program
 from vvgt_cli.volume.vtk.resample import MAX_EDGE
 from vvgt_cli.volume.vtk.xml import scan
 
@@ -154,23 +154,15 @@ def received(stream: IO[bytes]) -> tuple[dict[str, Any], np.ndarray] | None:
         return None
     facts = json.loads(line)
     dtype, shape = np.dtype(facts.pop("dtype", "u1")), tuple(facts.pop("shape", (0,)))
-    check_memory(count(shape) * dtype.itemsize, str(facts.get("name")))
-    values = np.empty(shape, dtype)
-    view, filled = values.reshape(-1).view(np.uint8).data, 0
-    while filled < values.nbytes:
-        n = stream.readinto(view[filled:])  # type: ignore[attr-defined]
-        if not n:
-            return None
-        filled += n
-    return facts, values
+    need = count(shape) * dtype.itemsize
+    check_memory(need, str(facts.get("name")))
+    values, filled = fill(stream, need)
+    return (facts, values.view(dtype).reshape(shape)) if filled == need else None
 
 
 def _ended(path: Path, program: str, status: int, seconds: int) -> DataError:
-    who = (
-        "ecCodes"
-        if program == GRIB
-        else f"VTK's reader of {'VTK' if program in (INDEX, SINGLE, IMAGE) else program} files"
-    )
+    own = {INDEX: "VTK", SINGLE: "VTK", IMAGE: "VTK"}
+    who = "ecCodes" if program == GRIB else f"VTK's reader of {own.get(program, program)} files"
     if status in STOPPED:
         return DataError(
             f"{path}: {who} was stopped (after {seconds} s, a minute of standstill, or for its memory); is it whole?"
@@ -281,7 +273,7 @@ def datasets(program: str, path: Path, time: int | None, array: str | None = Non
     if program in (SINGLE, IMAGE):
         return list(_dataset(path, ())), []
     if program != INDEX:
-        return read_program(PROGRAMS[program], path, time, array)
+        return read_program(program, path, time, array)
     index = read_index(path)
     return list(_indexed(index, time, ())), index.times
 
@@ -304,7 +296,7 @@ def _dataset(path: Path, above: tuple[Path, ...]) -> Iterator[Leaf]:
         yield from _indexed(read_index(path), None, above)
         return
     if head.startswith(HDF5):
-        yield from read_program(PROGRAMS["VTKHDF"], path, None)[0]
+        yield from read_program("VTKHDF", path, None)[0]
         return
     with quiet_vtk() as message:
         reader = _reader(path, kind, head)
@@ -322,8 +314,6 @@ def _reader(path: Path, kind: str | None, head: bytes) -> Any:
         scan(path)  # raises where the end of the file is missing
         return getattr(vtkIOXML, f"vtkXML{kind}Reader")()
     if head.startswith(b"# vtk DataFile"):
-        if is_legacy(head, grid=True):
-            check_legacy_grid(path)
         reader = vtkDataSetReader()
         for what in ("Scalars", "Vectors", "Normals", "Tensors", "ColorScalars", "TCoords", "Fields"):
             getattr(reader, f"ReadAll{what}On")()

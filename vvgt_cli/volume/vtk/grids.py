@@ -11,7 +11,8 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.components import ArrayInfo, select_from_array
-from vvgt_cli.volume.reading import ReadOptions, Volume, float_dtype, placed, printable
+from vvgt_cli.volume.reading import ReadOptions, Volume, float_dtype
+from vvgt_cli.volume.vtk.resample import Grid
 from vvgt_cli.volume.vtk.xml import GHOSTS, HIDDEN
 
 
@@ -20,8 +21,7 @@ def values_of(mesh: Any, info: ArrayInfo) -> np.ndarray:
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     data = mesh.GetPointData() if info.where == "point" else mesh.GetCellData()
-    result: np.ndarray = vtk_to_numpy(data.GetArray(info.name))
-    return result
+    return np.asarray(vtk_to_numpy(data.GetArray(info.name)))
 
 
 def arrays_of(mesh: Any) -> list[ArrayInfo]:
@@ -98,7 +98,7 @@ def visible(image: Any, field: np.ndarray, where: str) -> np.ndarray:
     for kind in ("point", "cell"):
         hidden = None if (kind, where) == ("point", "cell") else _hidden(image, kind)
         if hidden is not None:
-            hidden = hidden.reshape(image_place(image, kind)[0][::-1])
+            hidden = hidden.reshape(image_place(image, kind).dims[::-1])
             field = without(field, hidden if kind == where else around(hidden, field.shape))
     return field
 
@@ -119,13 +119,10 @@ def around(cells: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return cells
 
 
-def image_place(image: Any, where: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return dims, spacing and first position (x, y, z) of the points of a vtkImageData, or of its cell centres."""
-    low = np.array(image.GetExtent()[::2], float)
-    dims, spacing = np.array(image.GetDimensions()), np.array(image.GetSpacing())
-    if where == "cell":
-        low, dims = low + np.where(dims > 1, 0.5, 0.0), np.maximum(dims - 1, 1)
-    return dims, spacing, np.array(image.GetOrigin()) + _direction(image) @ (low * spacing)
+def image_place(image: Any, where: str) -> Grid:
+    """Return the grid of the points of a vtkImageData, or of its cell centres."""
+    extent = np.reshape(image.GetExtent(), (3, 2))
+    return Grid.of_image(extent, image.GetSpacing(), image.GetOrigin(), _direction(image), where)
 
 
 def _direction(image: Any) -> np.ndarray:
@@ -137,8 +134,7 @@ def image_volume(image: Any, info: ArrayInfo, options: ReadOptions, source: str,
     """Make a volume of a vtkImageData: point data, or cell data on the grid of cell centres."""
     if options.dims is not None:
         raise UsageError(f"{source}: an image, which is a regular grid already; leave out --dims")
-    dims, spacing, origin = image_place(image, info.where)
-    values = values_of(image, info).reshape(*dims[::-1], info.components)
+    grid = image_place(image, info.where)
+    values = values_of(image, info).reshape(*grid.dims[::-1], info.components)
     field = visible(image, select_from_array(values, info, options.component, source), info.where)
-    steps = (_direction(image) * spacing).T
-    return placed(field, steps, origin, options, name, quantity=printable(info.name))
+    return grid.volume(field, info, options, name)

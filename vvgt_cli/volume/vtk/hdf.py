@@ -13,7 +13,7 @@ import numpy as np
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.arrays.hdf5 import checked_dataset
 from vvgt_cli.volume.components import ArrayInfo, choose_array, selected_dtype
-from vvgt_cli.volume.reading import ReadOptions, Volume, printable, read_part, text_of, volume_name
+from vvgt_cli.volume.reading import ReadOptions, Volume, read_part, text_of, volume_name
 from vvgt_cli.volume.stored import Slices, stored_or_loaded
 from vvgt_cli.volume.vtk.child import volume_by_child
 from vvgt_cli.volume.vtk.index import chosen_time
@@ -43,11 +43,7 @@ def _image(h5py: Any, file: Any, path: Path, options: ReadOptions) -> Volume:
     if options.dims is not None:
         raise UsageError(f"{source}: an image, which is a regular grid already; leave out --dims")
     times = _times(h5py, file, path)
-    time = options.time
-    if chosen_time(times, time, source) is None:
-        time = None
-    elif time is None:
-        time = 0  # the only one
+    time = None if chosen_time(times, options.time, source) is None else options.time or 0
     image = {key: " ".join(map(str, np.ravel(root.attrs[key]).tolist())) for key in PLACE if key in root.attrs}
     infos = _arrays(h5py, root, len(times) > 0)
     info = infos[choose_array(infos, options.array, source)]
@@ -68,8 +64,7 @@ def _image(h5py: Any, file: Any, path: Path, options: ReadOptions) -> Volume:
 
     chunks = dataset.chunks[len(before) : len(before) + 3] if dataset.chunks else (1, *shape[1:])
     values = stored_or_loaded(read, dtype, shape, chunks, source, options.stored)
-    place = options.spacing_or(grid.spacing), grid.origin, grid.direction
-    return Volume(values, *place, volume_name(path), quantity=printable(info.name))
+    return grid.volume(values, info, options, volume_name(path))
 
 
 def _times(h5py: Any, file: Any, path: Path) -> list[float]:

@@ -13,9 +13,9 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.components import ArrayInfo, choose_array, select_from_array
-from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, count, float_dtype, printable, triple
+from vvgt_cli.volume.reading import IDENTITY, ReadOptions, Volume, check_memory, count, float_dtype, printable, triple
 from vvgt_cli.volume.vtk.grids import arrays_of, check_cells, image_place, image_volume, shown, values_of, visible
-from vvgt_cli.volume.vtk.resample import MAX_EDGE, Samples, grid_of, probe, sampled_volume
+from vvgt_cli.volume.vtk.resample import MAX_EDGE, Grid, grid_of, probe, sampled_volume
 
 ALIGNED = 1e-3  # voxels that images of one lattice may lie off
 EDGE = 1e-6  # of a cell: samples that lie on the face of a block are in it
@@ -134,64 +134,59 @@ def _field(leaf: Leaf, info: ArrayInfo, options: ReadOptions, source: str) -> tu
     values = values_of(data, own).reshape(1, 1, -1, own.components)
     field = select_from_array(values, info, options.component, source).ravel()
     if data.IsA("vtkImageData"):
-        field = visible(data, field.reshape(image_place(data, info.where)[0][::-1]), info.where).ravel()
+        field = visible(data, field.reshape(image_place(data, info.where).dims[::-1]), info.where).ravel()
     return replace(leaf, data=data), field
 
 
-def _lattice(images: Sequence[Any], where: str) -> Samples | None:
+def _lattice(images: Sequence[Any], where: str) -> Grid | None:
     """Find the one grid that images are boxes of; None where they are not, or it is larger than they are."""
-    if not all(image.IsA("vtkImageData") and _upright(image) for image in images):
+    places = [image_place(image, where) for image in images if image.IsA("vtkImageData")]
+    if len(places) < len(images) or any(place.direction != IDENTITY for place in places):
         return None
-    places = [image_place(image, where) for image in images]
-    steps = np.array([place[1] for place in places])
+    steps = np.array([place.spacing for place in places])
     if (np.abs(steps - steps[0]) > 1e-9 * steps[0]).any():
         return None
-    origins = np.array([place[2] for place in places])
+    origins = np.array([place.origin for place in places])
     first = origins.min(axis=0)
     begin = (origins - first) / steps[0]
     if np.abs(begin - begin.round()).max() > ALIGNED:
         return None
-    dims = (begin.round().astype(np.int64) + np.array([place[0] for place in places])).max(axis=0)
-    if count(tuple(dims)) > 4 * sum(count(tuple(place[0])) for place in places):
+    dims = (begin.round().astype(np.int64) + np.array([place.dims for place in places])).max(axis=0)
+    if count(tuple(dims)) > 4 * sum(count(place.dims) for place in places):
         return None
-    return Samples(triple(dims.tolist()), triple(steps[0].tolist()), triple(first.tolist()))
+    return Grid(triple(dims.tolist()), places[0].spacing, triple(first.tolist()))
 
 
-def _upright(image: Any) -> bool:
-    """Tell whether an image's axes are x, y and z."""
-    matrix = image.GetDirectionMatrix()
-    return all(matrix.GetElement(r, c) == (r == c) for r in range(3) for c in range(3))
-
-
-def _samples(leaves: Sequence[Leaf], dims: tuple[int, int, int] | None, source: str) -> Samples:
+def _samples(leaves: Sequence[Leaf], dims: tuple[int, int, int] | None, source: str) -> Grid:
     """Choose samples that fill all datasets: as fine as the finest level of images, else about as many as cells."""
     bounds = np.array([leaf.data.GetBounds() for leaf in leaves]).reshape(-1, 3, 2)
     box = np.stack([bounds[..., 0].min(axis=0), bounds[..., 1].max(axis=0)], axis=1)
     cells = sum(leaf.data.GetNumberOfCells() for leaf in leaves)
     if cells < 1:
         raise DataError(f"{source}: a mesh without cells; expected some to sample")
-    if dims is None and all(leaf.data.IsA("vtkImageData") and _upright(leaf.data) for leaf in leaves):
-        finest = np.min([leaf.data.GetSpacing() for leaf in leaves], axis=0)
+    images = [image_place(leaf.data, "point") for leaf in leaves if leaf.data.IsA("vtkImageData")]
+    if dims is None and len(images) == len(leaves) and all(image.direction == IDENTITY for image in images):
+        finest = np.min([image.spacing for image in images], axis=0)
         if (finest > 0).all() and np.isfinite(box).all():
             wanted = np.maximum(np.round((box[:, 1] - box[:, 0]) / finest), 1)
             dims = triple(np.ceil(wanted / max(wanted.max() / MAX_EDGE, 1)).astype(int).tolist())
     return grid_of(box, dims, cells, source)
 
 
-def _paint(data: Any, values: np.ndarray, where: str, grid: Samples, aligned: bool, out: np.ndarray) -> None:
+def _paint(data: Any, values: np.ndarray, where: str, grid: Grid, aligned: bool, out: np.ndarray) -> None:
     """Put the values of a dataset into the samples ``out`` (nz, ny, nx) that lie in it, or are it (``aligned``)."""
     origin, step = np.array(grid.origin), np.array(grid.spacing)
     if aligned:
-        dims, _, first = image_place(data, where)
-        begin = np.round((first - origin) / step).astype(int)
-        end, sampled, inside = begin + dims, values.reshape(dims[::-1]), np.array(True)
+        place = image_place(data, where)
+        begin = np.round((np.array(place.origin) - origin) / step).astype(int)
+        end, sampled, inside = begin + place.dims, values.reshape(place.dims[::-1]), np.array(True)
     else:
         bounds = np.array(data.GetBounds()).reshape(3, 2)
         begin = np.maximum(np.ceil((bounds[:, 0] - origin) / step - EDGE), 0).astype(int)
         end = np.minimum(np.floor((bounds[:, 1] - origin) / step + EDGE) + 1, grid.dims).astype(int)
         if not (begin < end).all():
             return
-        part = Samples(triple((end - begin).tolist()), grid.spacing, triple((origin + begin * step).tolist()))
+        part = Grid(triple((end - begin).tolist()), grid.spacing, triple((origin + begin * step).tolist()))
         sampled, inside = probe(data, values, where, part)
     target = out[tuple(slice(a, b) for a, b in zip(begin[::-1], end[::-1], strict=True))]
     np.copyto(target, sampled, where=inside & ~np.isnan(sampled), casting="unsafe")

@@ -17,7 +17,6 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import count, load_block
 from vvgt_cli.volume.components import ArrayInfo, choose_array, select_from_array
 from vvgt_cli.volume.reading import ReadOptions, Volume, printable, volume_name
-from vvgt_cli.volume.vtk import LEGACY_GRIDS
 from vvgt_cli.volume.vtk.xml import IMAGE_BY_VTK, image_grid
 
 # vtkIdType is stored as int; long is that of a 64-bit machine.
@@ -26,7 +25,11 @@ _TYPES = {
     "int": "i4", "unsigned_int": "u4", "long": "i8", "unsigned_long": "u8", "vtktypeint64": "i8", "vtktypeuint64": "u8",
     "vtkidtype": "i4", "float": "f4", "double": "f8",
 }  # fmt: skip
+_KINDS = ("STRUCTURED_POINTS", "IMAGE_DATA")
 _FIXED = {"VECTORS": 3, "NORMALS": 3, "TENSORS": 9, "TENSORS6": 6, "GLOBAL_IDS": 1, "PEDIGREE_IDS": 1, "EDGE_FLAGS": 1}
+_PLACE = {  # of VTK's XML; "" is not read
+    "EXTENT": "WholeExtent", "ORIGIN": "Origin", "SPACING": "Spacing", "ASPECT_RATIO": "Spacing", "DIRECTION": "",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -42,13 +45,11 @@ class _Array:
 class Parser:
     """Walks the sections of a binary legacy file and notes the arrays; values are skipped, not read."""
 
-    KINDS: tuple[str, ...] = ("STRUCTURED_POINTS", "IMAGE_DATA")
-
     def __init__(self, text: mmap.mmap, path: Path) -> None:
         """Begin at the start of ``text``."""
         self.text, self.path, self.position = text, path, 0
         self.arrays: list[_Array] = []
-        self.geometry: dict[str, list[str]] = {}
+        self.image: dict[str, str] = {}  # as VTK's XML has it
         self.where, self.tuples = "", 0
 
     def line(self) -> str | None:
@@ -82,11 +83,11 @@ class Parser:
         if coding not in ("ASCII", "BINARY"):
             raise self.bad(f"coding is {coding[:40]!r}; expected ASCII or BINARY")
         first, *kind = self.words() or ["nothing"]
-        if first.upper() != "DATASET" or "".join(kind[:1]).upper() not in self.KINDS:
+        if first.upper() != "DATASET" or "".join(kind[:1]).upper() not in _KINDS:
             shown = "".join(kind[:1]).lower().replace("_", " ")[:40] if first.upper() == "DATASET" else ""
             raise DataError(
                 f"{self.path}: a legacy VTK file of a {printable(shown) or 'field without a grid'}; expected "
-                f"{' or '.join(self.KINDS)}; resample it first (ParaView: Resample To Image) and save it as .vti"
+                f"{' or '.join(_KINDS)}; resample it first (ParaView: Resample To Image) and save it as .vti"
             )
         while coding == "BINARY" and (words := self.words()) is not None:
             self.section(words[0].upper(), words)
@@ -94,8 +95,10 @@ class Parser:
 
     def section(self, key: str, words: list[str]) -> None:
         """Read one line that is a keyword, with the values that belong to it."""
-        if key in ("DIMENSIONS", "ORIGIN", "SPACING", "ASPECT_RATIO", "EXTENT", "DIRECTION"):
-            self.geometry["SPACING" if key == "ASPECT_RATIO" else key] = words[1:]
+        if key == "DIMENSIONS":
+            self.image.setdefault("WholeExtent", " ".join(f"0 {int(n) - 1}" for n in words[1:]))
+        elif key in _PLACE:
+            self.image[_PLACE[key]] = " ".join(words[1:])
         elif key in ("POINT_DATA", "CELL_DATA"):
             self.where, self.tuples = key[:-5].lower(), int(words[1])
         elif key == "METADATA":
@@ -172,49 +175,6 @@ class Parser:
             self.position += width + (length & ((1 << (8 * width - 2)) - 1))
 
 
-class _Sections(Parser):
-    """The sections of a binary mesh or grid: VTK's reader leaves what is missing as it is in memory."""
-
-    KINDS = LEGACY_GRIDS
-
-    def section(self, key: str, words: list[str]) -> None:
-        if key in ("X_COORDINATES", "Y_COORDINATES", "Z_COORDINATES"):
-            self.skip(words[2].lower(), int(words[1]))
-        elif key == "POINTS":
-            self.skip(words[2].lower(), 3 * int(words[1]))
-        elif key == "CELL_TYPES":
-            self.skip("int", int(words[1]))
-        elif key == "CELLS":
-            self.cells(int(words[1]), int(words[2]))
-        else:
-            super().section(key, words)
-
-    def cells(self, first: int, second: int) -> None:
-        """Skip cells, stored as numbers in a row (version 4) or as offsets and connectivity (5.1)."""
-        if not self.text[self.position : self.position + 64].lstrip().startswith(b"OFFSETS"):
-            self.skip("int", second)
-            return
-        for n in (first, second):
-            words = self.words() or []
-            if len(words) != 2:
-                raise self.bad("CELLS without OFFSETS and CONNECTIVITY")
-            self.skip(words[1].lower(), n)
-
-
-def check_legacy_grid(path: Path) -> None:
-    """Raise DataError if a binary legacy mesh or grid does not hold what its sections declare."""
-    with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
-        _Sections(text, path).parse()
-
-
-def _image(parser: Parser) -> dict[str, str]:
-    """Return extent, spacing and origin as VTK's XML has them."""
-    stated = {key: " ".join(words) for key, words in parser.geometry.items()}
-    dims = [int(n) for n in parser.geometry.get("DIMENSIONS", ())]
-    extent = stated.get("EXTENT", " ".join(f"0 {n - 1}" for n in dims))
-    return {"WholeExtent": extent} | {key.title(): stated[key] for key in ("SPACING", "ORIGIN") if key in stated}
-
-
 def read_legacy(path: Path, options: ReadOptions) -> Volume:
     """Read a legacy VTK image: point data, or cell data on the grid of cell centres."""
     with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
@@ -223,9 +183,8 @@ def read_legacy(path: Path, options: ReadOptions) -> Volume:
         if binary:
             array = parser.arrays[choose_array([a.info for a in parser.arrays], options.array, str(path))]
         if not binary or array.type == "bit":
-            volume: Volume = IMAGE_BY_VTK(path, replace(options, array=array.info.name) if binary else options)
-            return volume
-        grid = image_grid(_image(parser), array.info.where, path)
+            return IMAGE_BY_VTK(path, replace(options, array=array.info.name) if binary else options)
+        grid = image_grid(parser.image, array.info.where, path)
     shape = (*reversed(grid.dims), array.info.components)
     if count(shape[:3]) != array.tuples:
         raise DataError(
@@ -234,5 +193,4 @@ def read_legacy(path: Path, options: ReadOptions) -> Volume:
         )
     values = load_block(path, np.dtype(_TYPES[array.type]).newbyteorder(">"), shape, offset=array.start)
     field = select_from_array(values, array.info, options.component, str(path))
-    place = options.spacing_or(grid.spacing), grid.origin, grid.direction
-    return Volume(field, *place, volume_name(path), quantity=printable(array.info.name))
+    return grid.volume(field, array.info, options, volume_name(path))

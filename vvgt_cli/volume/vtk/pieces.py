@@ -17,9 +17,9 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import count, data_file, is_large
 from vvgt_cli.volume.components import ArrayInfo, choose_array, selected_dtype
-from vvgt_cli.volume.reading import ReadOptions, Volume, float_dtype, printable, triple, volume_name
+from vvgt_cli.volume.reading import ReadOptions, Volume, float_dtype, volume_name
 from vvgt_cli.volume.stored import Slices, is_file_backed, put_block, read_block, stored_or_loaded
-from vvgt_cli.volume.vtk.xml import GHOSTS, HIDDEN, Scan, extent_dims, extent_of, image_grid, image_values, scan
+from vvgt_cli.volume.vtk.xml import GHOSTS, HIDDEN, Scan, extent_of, image_grid, image_values, scan
 
 MAX_KEPT = 256 << 20  # bytes of unpacked pieces that a process keeps
 OPEN = 64  # mapped pieces that a process keeps open
@@ -45,8 +45,7 @@ def read_pvti(path: Path, options: ReadOptions) -> Volume:
     shape, dtype = grid.dims[::-1], pieces.dtype
     kept = options.stored or (options.packed and is_large(count(shape) * dtype.itemsize))
     field = stored_or_loaded(pieces.read, dtype, shape, pieces.chunks, str(path), kept)
-    place = options.spacing_or(grid.spacing), grid.origin, grid.direction
-    return Volume(field, *place, volume_name(path), quantity=printable(info.name))
+    return grid.volume(field, info, options, volume_name(path))
 
 
 class _Pieces:
@@ -61,9 +60,8 @@ class _Pieces:
     def __init__(self, document: Scan, info: ArrayInfo, options: ReadOptions, path: Path) -> None:
         self.path, self.info, self.options = path, info, replace(options, stored=False)  # a piece is held as a whole
         self.names = [name for name, _ in document.sources]
-        whole = np.array(extent_of(document.image.get("WholeExtent", ""), path)).reshape(3, 2)
-        extents = [extent_of(text, path, f"Extent of piece {name!r}") for name, text in document.sources]
-        boxes = np.array(extents, np.int64).reshape(-1, 3, 2)
+        whole = extent_of(document.image.get("WholeExtent", ""), path)
+        boxes = np.array([extent_of(text, path, f"Extent of piece {name!r}") for name, text in document.sources])
         bad = (boxes[..., 0] > boxes[..., 1]) | (boxes[..., 0] < whole[:, 0]) | (boxes[..., 1] > whole[:, 1])
         if bad.any():
             name, text = document.sources[int(np.flatnonzero(bad.any(axis=1))[0])]
@@ -80,7 +78,6 @@ class _Pieces:
         opened = self._scan(0)
         if "Direction" not in document.image and "Direction" in opened.image:
             self.image = {**document.image, "Direction": opened.image["Direction"]}  # VTK's writer leaves it out
-        extent_dims(self.image, path)
         self.dtype = self._dtype(document)
         if self.hiding and info.where == "point":  # one is hidden where all pieces that have it say so
             self._hi, self._overlap = boxes[..., 1] - self._first + 1, True
@@ -160,7 +157,7 @@ class _Pieces:
             text = "none of that name" if row is None else str(row.info)
             raise DataError(f"{file}: {text}; expected {self.info} as {self.path.name} says")
         grid = image_grid(header.image, self.info.where, file)
-        extent = np.array(extent_of(header.image["WholeExtent"], file)).reshape(3, 2)
+        extent = extent_of(header.image["WholeExtent"], file)
         first = extent[:, 0] - self._first
         inside = (first <= self._lo[k]).all() and (first + grid.dims >= self._hi[k]).all()
         step = {key: self.image.get(key) for key in ("Origin", "Spacing", "Direction")}
@@ -173,7 +170,7 @@ class _Pieces:
                 f"place that {self.path.name} gives it"
             )
         values = image_values(header, row.info, grid, self.options, file)
-        return Volume(values, triple(grid.spacing), name=file.name), first
+        return Volume(values, grid.spacing, name=file.name), first
 
 
 def _overlapping(lo: np.ndarray, hi: np.ndarray) -> bool:

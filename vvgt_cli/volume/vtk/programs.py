@@ -1,7 +1,6 @@
 """Files of simulation programs, by VTK's readers: EnSight, Exodus, OpenFOAM, XDMF, CGNS, Plot3D, and VTKHDF.
 
-A row of `PROGRAMS` names a format's endings, how it begins and its VTK reader. All of it runs in a process of its own
-(`vvgt_cli.volume.vtk.child`): the readers trust their files.
+All of it runs in a process of its own (`vvgt_cli.volume.vtk.child`): the readers trust their files.
 """
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ import json
 import re
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,27 +21,13 @@ from vvgt_cli.volume.vtk.messages import quiet_vtk
 from vvgt_cli.volume.vtk.xml import walk_xml
 
 MAX_NAMES = 100_000  # files that a case may name
-
-
-@dataclass(frozen=True)
-class Program:
-    """A format.
-
-    Attributes:
-        name: for messages.
-        reader: what makes VTK's reader of a file, all arrays enabled.
-        skips: its reader goes on without the fields that it cannot read.
-    """
-
-    name: str
-    reader: Callable[[Path], Any]
-    skips: bool = False
+SKIPS = "OpenFOAM"  # whose reader goes on without the fields that it cannot read
 
 
 def read_program(
-    program: Program, path: Path, time: int | None, array: str | None = None
+    program: str, path: Path, time: int | None, array: str | None = None
 ) -> tuple[list[Leaf], list[float]]:
-    """Read the datasets of a time step, and the times of all steps.
+    """Read the datasets of a time step of a format of `PROGRAMS`, and the times of all steps.
 
     Raises:
         DataError: damaged, or a file that it names is missing or lies elsewhere, or VTK cannot read field ``array``.
@@ -52,7 +36,7 @@ def read_program(
     from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline
 
     with quiet_vtk() as message:
-        reader = program.reader(path)
+        reader = PROGRAMS[program](path)
         reader.UpdateInformation()
         facts = reader.GetOutputInformation(0)
         times = list(facts.Get(vtkStreamingDemandDrivenPipeline.TIME_STEPS()) or ())
@@ -65,7 +49,7 @@ def read_program(
         output = reader.GetOutputDataObject(0)
         leaves = [leaf for leaf in leaves_of(output) if leaf.data.GetNumberOfPoints() > 0]
         error, errors = message(errors=True) or first_error, message(errors=True, every=True)
-    if program.skips and leaves and error and not first_error and _mesh_is_sound(program, path, chosen):
+    if program == SKIPS and leaves and error and not first_error and _mesh_is_sound(program, path, chosen):
         held = {info.name for info in arrays_in(leaves)}
         lost = [name for k in range(reader.GetNumberOfCellArrays()) if (name := reader.GetCellArrayName(k)) not in held]
         lost = [
@@ -79,14 +63,14 @@ def read_program(
         return leaves, times
     if error or not leaves:
         fault = f"cannot read it ({error})" if leaves else f"finds no dataset in it ({error or 'no message'})"
-        raise DataError(f"{path}: VTK {fault}; is the {program.name} file whole?")
+        raise DataError(f"{path}: VTK {fault}; is the {program} file whole?")
     return leaves, times
 
 
-def _mesh_is_sound(program: Program, path: Path, time: float | None) -> bool:
+def _mesh_is_sound(program: str, path: Path, time: float | None) -> bool:
     """Return whether VTK reads a time step without an error when all fields are switched off."""
     with quiet_vtk() as message:
-        reader = program.reader(path)
+        reader = PROGRAMS[program](path)
         reader.DisableAllCellArrays()
         reader.DisableAllPointArrays()
         reader.UpdateTimeStep(0.0 if time is None else time)
@@ -272,12 +256,12 @@ def _vtkhdf(path: Path) -> Any:
     return reader
 
 
-PROGRAMS = {
-    "VTKHDF": Program("VTKHDF", _vtkhdf),
-    "EnSight": Program("EnSight", _ensight),
-    "Exodus": Program("Exodus", _exodus),
-    "OpenFOAM": Program("OpenFOAM", _openfoam, skips=True),
-    "XDMF": Program("XDMF", _xdmf),
-    "CGNS": Program("CGNS", _cgns),
-    "Plot3D": Program("Plot3D", _plot3d),
+PROGRAMS: dict[str, Callable[[Path], Any]] = {  # what makes VTK's reader of a file, all arrays enabled
+    "VTKHDF": _vtkhdf,
+    "EnSight": _ensight,
+    "Exodus": _exodus,
+    "OpenFOAM": _openfoam,
+    "XDMF": _xdmf,
+    "CGNS": _cgns,
+    "Plot3D": _plot3d,
 }

@@ -10,21 +10,11 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.reading import Volume, check_memory, count, float_dtype, triple
+from vvgt_cli.volume.components import ArrayInfo
+from vvgt_cli.volume.reading import IDENTITY, ReadOptions, Volume, check_memory, count, float_dtype, printable, triple
+from vvgt_cli.volume.space import unit_rows
 
 MAX_EDGE = 512  # voxels along an axis, where nobody said how many
-
-
-def _rectilinear(coordinates: Sequence[np.ndarray]) -> Any:
-    """Make a vtkRectilinearGrid of points at ascending coordinates along x, y and z."""
-    from vtkmodules.util.numpy_support import numpy_to_vtk
-    from vtkmodules.vtkCommonDataModel import vtkRectilinearGrid
-
-    grid = vtkRectilinearGrid()
-    grid.SetDimensions(*map(len, coordinates))
-    for along, put in zip(coordinates, (grid.SetXCoordinates, grid.SetYCoordinates, grid.SetZCoordinates), strict=True):
-        put(numpy_to_vtk(np.ascontiguousarray(along, np.float64), deep=True))
-    return grid
 
 
 def resample(
@@ -41,7 +31,13 @@ def resample(
     Raises:
         DataError: no cells, or memory that does not suffice.
     """
-    mesh = _rectilinear(coordinates)
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkCommonDataModel import vtkRectilinearGrid
+
+    mesh = vtkRectilinearGrid()
+    mesh.SetDimensions(*map(len, coordinates))
+    for along, put in zip(coordinates, (mesh.SetXCoordinates, mesh.SetYCoordinates, mesh.SetZCoordinates), strict=True):
+        put(numpy_to_vtk(np.ascontiguousarray(along, np.float64), deep=True))
     if mesh.GetNumberOfCells() < 1:
         raise DataError(f"{source}: a mesh without cells; expected some to sample")
     grid = grid_of(np.array(mesh.GetBounds()).reshape(3, 2), dims, mesh.GetNumberOfCells(), source)
@@ -51,24 +47,53 @@ def resample(
 
 
 @dataclass(frozen=True)
-class Samples:
-    """A regular grid of samples: dims, spacing, and the first sample, (x, y, z)."""
+class Grid:
+    """A regular grid of values: dims, spacing, and the place of the first, (x, y, z); direction row-major."""
 
     dims: tuple[int, int, int]
     spacing: tuple[float, float, float]
     origin: tuple[float, float, float]
+    direction: tuple[float, ...] = IDENTITY
+
+    @classmethod
+    def of_image(cls, extent: Any, spacing: Any, origin: Any, direction: Any, where: str) -> Grid:
+        """Return the grid of an image's points, or of its cell centres: half a voxel further, one fewer per axis.
+
+        ``extent`` (3, 2) are the first and last point along x, y and z, ``direction`` is row-major.
+        """
+        (low, high), axes = np.transpose(extent), np.reshape(direction, (3, 3))
+        dims = high - low + 1
+        if where == "cell":
+            low, dims = low + np.where(dims > 1, 0.5, 0.0), np.maximum(dims - 1, 1)
+        first = origin + (axes * (low * np.asarray(spacing))).sum(axis=1)
+        lengths, turned = unit_rows((axes * np.asarray(spacing)).T)
+        return cls(triple(dims.tolist()), triple(lengths), triple(first.tolist()), turned)
+
+    def volume(self, values: np.ndarray, info: ArrayInfo, options: ReadOptions, name: str) -> Volume:
+        """Make the volume of an array's values (nz, ny, nx)."""
+        place = options.spacing_or(self.spacing), self.origin, self.direction
+        return Volume(values, *place, name, quantity=printable(info.name))
 
 
-def grid_of(bounds: np.ndarray, dims: tuple[int, int, int] | None, cells: int, source: str) -> Samples:
+def grid_of(bounds: np.ndarray, dims: tuple[int, int, int] | None, cells: int, source: str) -> Grid:
     """Choose samples at the centres of voxels that fill ``bounds`` (3, 2); raise DataError if these are not finite."""
     if not np.isfinite(bounds).all():
         raise DataError(f"{source}: its bounding box {bounds.ravel().tolist()} is not finite")
-    size, spacing = _grid(bounds, dims, cells)
-    flat = bounds[:, 0] == bounds[:, 1]
-    return Samples(size, spacing, triple(np.where(flat, bounds[:, 0], bounds[:, 0] + np.array(spacing) / 2).tolist()))
+    extent = bounds[:, 1] - bounds[:, 0]
+    thick = extent > 0
+    if dims is None:
+        edge = (np.prod(extent[thick]) / cells) ** (1 / max(thick.sum(), 1)) if thick.any() else 1.0
+        edge = max(edge, extent.max() / MAX_EDGE)
+        wanted = np.clip(np.ceil(extent / edge - 1e-9), 1, MAX_EDGE).astype(int)
+    else:
+        wanted = np.where(thick, dims, 1)
+    steps = np.where(thick, extent / wanted, 0.0)
+    steps = np.where(thick, steps, steps[thick].mean() if thick.any() else 1.0)
+    first = bounds[:, 0] + np.where(extent == 0, 0.0, steps / 2)
+    return Grid(triple(wanted.tolist()), triple(steps.tolist()), triple(first.tolist()))
 
 
-def probe(mesh: Any, values: np.ndarray, where: str, grid: Samples) -> tuple[np.ndarray, np.ndarray]:
+def probe(mesh: Any, values: np.ndarray, where: str, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     """Return samples (nz, ny, nx) of values (n,) of a vtkDataSet's points or cells, and a mask of those inside."""
     from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
     from vtkmodules.vtkCommonDataModel import vtkImageData
@@ -94,40 +119,20 @@ def probe(mesh: Any, values: np.ndarray, where: str, grid: Samples) -> tuple[np.
 
 
 def sampled_volume(
-    values: np.ndarray, inside: np.ndarray, dtype: np.dtype, grid: Samples, dims: object, source: str, name: str
+    values: np.ndarray, inside: np.ndarray, dtype: np.dtype, grid: Grid, dims: object, source: str, name: str
 ) -> Volume:
     """Make the volume of samples, and warn of their number if ``dims`` is None; raise DataError if none is inside.
 
     Values are (nz, ny, nx), NaN where not ``inside``; ``dtype`` is theirs before sampling.
     """
+    size = " x ".join(map(str, grid.dims))
     if not inside.any():
-        raise DataError(f"{source}: no sample of {_text(grid.dims)} lies in a cell of the mesh; try other --dims")
+        raise DataError(f"{source}: no sample of {size} lies in a cell of the mesh; try other --dims")
     if dims is None:
         edges = " x ".join(f"{edge:.6g}" for edge in grid.spacing)
         warnings.warn(
-            f"{source}: resampled to {_text(grid.dims)} voxels of {edges}, by its cells (--dims X Y Z decides)",
+            f"{source}: resampled to {size} voxels of {edges}, by its cells (--dims X Y Z decides)",
             stacklevel=2,
         )
-    label = f"{name} (resampled to {_text(grid.dims)})"
+    label = f"{name} (resampled to {size})"
     return Volume(values.astype(float_dtype(dtype)), grid.spacing, grid.origin, name=label)
-
-
-def _text(size: Sequence[int]) -> str:
-    return " x ".join(map(str, size))
-
-
-def _grid(
-    bounds: np.ndarray, dims: tuple[int, int, int] | None, cells: int
-) -> tuple[tuple[int, int, int], tuple[float, float, float]]:
-    """Return voxels and their edges along x, y, z."""
-    extent = bounds[:, 1] - bounds[:, 0]
-    thick = extent > 0
-    if dims is None:
-        edge = (np.prod(extent[thick]) / cells) ** (1 / max(thick.sum(), 1)) if thick.any() else 1.0
-        edge = max(edge, extent.max() / MAX_EDGE)
-        wanted = np.clip(np.ceil(extent / edge - 1e-9), 1, MAX_EDGE).astype(int)
-    else:
-        wanted = np.where(thick, dims, 1)
-    steps = np.where(thick, extent / wanted, 0.0)
-    steps = np.where(thick, steps, steps[thick].mean() if thick.any() else 1.0)
-    return triple(wanted.tolist()), triple(steps.tolist())

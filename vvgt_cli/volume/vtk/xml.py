@@ -9,33 +9,31 @@ from __future__ import annotations
 
 import base64
 import binascii
-import lzma
 import re
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import cast
 from xml.parsers import expat
 
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.blocks import count, load_block
+from vvgt_cli.volume.blocks import count, load_block, unpack
 from vvgt_cli.volume.components import ArrayInfo, choose_array, magnitude, select_from_array, selected_dtype
 from vvgt_cli.volume.readers import HEAD_BYTES, lazy, volume_name
-from vvgt_cli.volume.reading import ReadOptions, Slices, printable, type_of, unit_rows
+from vvgt_cli.volume.reading import ReadOptions, Slices, type_of
 from vvgt_cli.volume.stored import stored_or_loaded
 from vvgt_cli.volume.types import IDENTITY, Volume
 from vvgt_cli.volume.vtk import IMAGE, xml_kind
 from vvgt_cli.volume.vtk.messages import quiet_vtk
+from vvgt_cli.volume.vtk.resample import Grid
 
 DATA = {"PointData": "point", "CellData": "cell", "PPointData": "point", "PCellData": "cell"}
 GHOSTS = "vtkGhostType"  # array of marks: bit 1 of a point and bit 5 of a cell hide it (vtkDataSetAttributes)
 HIDDEN = {"point": 2, "cell": 32}
 TAIL = 4096  # bytes in which a file with appended data ends
-LZMA_MEMORY = 1 << 28  # bytes of its dictionary
-IMAGE_BY_VTK = lazy("vtk.child.volume_by_child", IMAGE)  # path and options to volume
+IMAGE_BY_VTK: Callable[[Path, ReadOptions], Volume] = lazy("vtk.child.volume_by_child", IMAGE)
 _CHUNK = 1 << 16
 
 
@@ -182,46 +180,22 @@ def _numbers(text: str, n: int, path: Path, what: str) -> list[float]:
     return values
 
 
-@dataclass(frozen=True)
-class Grid:
-    """Dims, origin and spacing (x, y, z) of the values, direction row-major."""
-
-    dims: tuple[int, ...]
-    origin: tuple[float, ...]
-    spacing: tuple[float, ...]
-    direction: tuple[float, ...]
-
-
-def extent_of(text: str, path: Path, what: str = "WholeExtent") -> list[int]:
-    """Parse the six numbers of an extent, or raise DataError."""
-    return [int(e) for e in _numbers(text, 6, path, what)]
-
-
-def extent_dims(image: dict[str, str], path: Path) -> list[int]:
-    """Return the points along (x, y, z) of an image or structured grid; raise DataError if there are none."""
-    extent = extent_of(image.get("WholeExtent", ""), path)
-    dims = [extent[2 * k + 1] - extent[2 * k] + 1 for k in range(3)]
-    if min(dims) < 1:
-        raise DataError(f"{path}: WholeExtent {extent} is empty; expected at least one voxel along each axis")
-    return dims
+def extent_of(text: str, path: Path, what: str = "WholeExtent") -> np.ndarray:
+    """Parse an extent, (3, 2) int64: first and last point along x, y and z; raise DataError for anything else."""
+    return np.array([int(e) for e in _numbers(text, 6, path, what)], np.int64).reshape(3, 2)
 
 
 def image_grid(image: dict[str, str], where: str, path: Path) -> Grid:
-    """Return the grid of points, or of cell centres (half a voxel further, one fewer per axis), or raise DataError."""
-    extent, dims = extent_of(image.get("WholeExtent", ""), path), extent_dims(image, path)
+    """Return the grid of an image's points or cells, or raise DataError."""
+    extent = extent_of(image.get("WholeExtent", ""), path)
+    if (extent[:, 0] > extent[:, 1]).any():
+        raise DataError(
+            f"{path}: WholeExtent {extent.ravel().tolist()} is empty; expected at least one voxel along each axis"
+        )
     spacing = _numbers(image.get("Spacing", "1 1 1"), 3, path, "Spacing")
     origin = _numbers(image.get("Origin", "0 0 0"), 3, path, "Origin")
-    direction: tuple[float, ...] = IDENTITY
-    if "Direction" in image:
-        direction = tuple(_numbers(image["Direction"], 9, path, "Direction"))
-    first = [float(extent[2 * k]) for k in range(3)]
-    if where == "cell":
-        first = [f + 0.5 if d > 1 else f for f, d in zip(first, dims, strict=True)]
-        dims = [max(d - 1, 1) for d in dims]
-    step = [f * s for f, s in zip(first, spacing, strict=True)]
-    origin = [o + sum(direction[3 * row + k] * step[k] for k in range(3)) for row, o in enumerate(origin)]
-    axes = [[direction[3 * row + k] * spacing[k] for row in range(3)] for k in range(3)]
-    return Grid(tuple(dims), tuple(origin), *unit_rows(axes))
+    direction = _numbers(image["Direction"], 9, path, "Direction") if "Direction" in image else IDENTITY
+    return Grid.of_image(extent, spacing, origin, direction, where)
 
 
 def read_vti(path: Path, options: ReadOptions) -> Volume:
@@ -235,8 +209,7 @@ def read_vti(path: Path, options: ReadOptions) -> Volume:
     info = header.infos[choose_array(header.infos, options.array, str(path))]
     grid = image_grid(header.image, info.where, path)
     values = image_values(header, info, grid, options, path)
-    place = options.spacing_or(grid.spacing), grid.origin, grid.direction
-    return Volume(values, *place, volume_name(path), quantity=printable(info.name))
+    return grid.volume(values, info, options, volume_name(path))
 
 
 def time_value(path: Path) -> float | None:
@@ -274,12 +247,11 @@ def image_values(header: Scan, info: ArrayInfo, grid: Grid, options: ReadOptions
         if appended and header.appended == "raw" and not compressor:
             stored = _mapped(header, info, grid, start, path)
             return select_from_array(stored, info, options.component, str(path))
-        if compressor in _UNPACK and (form == "binary" or (appended and header.appended in ("raw", "base64"))):
+        if compressor in _CODINGS and (form == "binary" or (appended and header.appended in ("raw", "base64"))):
             start = start if appended else _text_of(path, row.position)
             coded = not appended or header.appended == "base64"
-            packed: np.ndarray = packed_array(header, info, grid, start, coded, options, path)
-            return packed
-    values: np.ndarray = IMAGE_BY_VTK(path, replace(options, array=info.name or None, spacing=None)).data
+            return packed_array(header, info, grid, start, coded, options, path)
+    values = IMAGE_BY_VTK(path, replace(options, array=info.name or None, spacing=None)).data
     if values.shape != grid.dims[::-1]:
         raise DataError(f"{path}: points and cells have an array {info.name!r} each; rename one of them")
     return values
@@ -324,7 +296,7 @@ def block_table(path: Path, start: int, word: np.dtype, coded: bool) -> np.ndarr
 
 def packed_array(
     header: Scan, info: ArrayInfo, grid: Grid, start: int, coded: bool, options: ReadOptions, path: Path
-) -> Any:
+) -> np.ndarray:
     """Read a component (nz, ny, nx) of a compressed array, or leave it in its file.
 
     The first word before its blocks is at byte ``start``; ``coded``: all is in base64.
@@ -347,7 +319,7 @@ def packed_array(
     begins = np.concatenate([[0], np.cumsum(sizes)])
     size = len(words) * word.itemsize
     place = start + (4 * -(-size // 3) if coded else size)
-    packed = _Blocks(path, _UNPACK[header.root["compressor"]], coded, place, begins, each, need)
+    packed = _Blocks(path, _CODINGS[header.root["compressor"]], coded, place, begins, each, need)
     _, ny, nx, components = shape
     row = nx * components * dtype.itemsize
 
@@ -367,20 +339,10 @@ def packed_array(
 
     rows = max(each // row, 1)
     chunks = (max(rows // ny, 1), min(rows, ny), nx)
-    return stored_or_loaded(read, kind, shape[:3], chunks, str(path), options.stored)
+    return cast(np.ndarray, stored_or_loaded(read, kind, shape[:3], chunks, str(path), options.stored))
 
 
-def _lz4(data: bytes, need: int) -> bytes:
-    import lz4.block
-
-    return bytes(lz4.block.decompress(data, uncompressed_size=need))
-
-
-_UNPACK: dict[str, Callable[[bytes, int], bytes]] = {
-    "vtkZLibDataCompressor": lambda data, need: zlib.decompressobj().decompress(data, need + 1),
-    "vtkLZ4DataCompressor": _lz4,
-    "vtkLZMADataCompressor": lambda data, need: lzma.LZMADecompressor(memlimit=LZMA_MEMORY).decompress(data, need + 1),
-}
+_CODINGS = {"vtkZLibDataCompressor": "zlib", "vtkLZ4DataCompressor": "lz4", "vtkLZMADataCompressor": "xz"}
 
 
 @dataclass(frozen=True)
@@ -389,7 +351,7 @@ class _Blocks:
 
     Attributes:
         path: the file.
-        unpack: unpacks a block, to few bytes more than the size that is given.
+        coding: of `blocks.unpack`.
         coded: in base64.
         place: byte of the file where they begin.
         begins: (n + 1) packed bytes before each, and in all.
@@ -398,7 +360,7 @@ class _Blocks:
     """
 
     path: Path
-    unpack: Callable[[bytes, int], bytes]
+    coding: str
     coded: bool
     place: int
     begins: np.ndarray
@@ -415,7 +377,9 @@ class _Blocks:
             if k not in kept:
                 part = packed[int(self.begins[k]) - begin : int(self.begins[k + 1]) - begin]
                 kept.clear()
-                kept[k] = self._unpacked(part, min(self.each, self.size - k * self.each))
+                need, kept[k] = min(self.each, self.size - k * self.each), unpack(self.coding, part, self.each + 1)
+                if len(kept[k]) != need:
+                    raise ValueError(f"a block of {len(kept[k])} bytes where {need} are expected")
             parts.append(kept[k])
         return b"".join(parts)[lo - first * self.each : hi - first * self.each]
 
@@ -428,9 +392,3 @@ class _Blocks:
             file.seek(self.place + lo // 3 * 4)
             data = base64.b64decode(file.read((-(-hi // 3) - lo // 3) * 4), validate=True)
             return data[lo % 3 : lo % 3 + hi - lo]
-
-    def _unpacked(self, data: bytes, need: int) -> bytes:
-        out = self.unpack(data, need)
-        if len(out) != need:
-            raise ValueError(f"a block of {len(out)} bytes where {need} are expected")
-        return out
