@@ -7,7 +7,8 @@ python benchmarks/page.py --table page.csv
 Needs Chromium, node and npm, as `make viewers` does. Options of a scene are --spacing, --layer and --labels, its
 functions are files in FUNCTIONS or names, separated by spaces; "-": its own look. "first" and "rest" are PSNR in dB of
 one frame and of 8 jittered ones, on strips of the first view of an orbit, as WebGL in software is slow. The kind "cut"
-shows the upper half of x (of an upright volume), by a box on the page and by --crop. A function in a .label.json file is a table of labels.
+shows the upper half of x (of an upright volume), by a box on the page and by --crop. A function in a -labels.json file
+is a table of labels.
 """
 
 from __future__ import annotations
@@ -83,7 +84,8 @@ def reading_and_look(options: str, data: Path) -> tuple[Reading, Look]:
         elif option == "--layer":
             look = replace(look, layers=(*look.layers, str(data / words.pop(0))))
         else:
-            look = replace(look, labels=str(data / words.pop(0)))
+            table = words.pop(0)
+            look = replace(look, labels=table if table == "auto" else str(data / table))
     return reading, look
 
 
@@ -114,7 +116,9 @@ def strips(picture: np.ndarray) -> np.ndarray:
     return np.concatenate([picture[top : top + ROWS] for top in tops(len(picture))])
 
 
-def pictures(person: Person, look: dict[str, Any], kind: int, cut: float, size: int, out: Path) -> dict[str, np.ndarray]:
+def pictures(
+    person: Person, look: dict[str, Any], kind: int, cut: float, size: int, out: Path
+) -> dict[str, np.ndarray]:
     """Strips of pictures by the page, by `FRAMES`."""
     found = {}
     for name, frames in FRAMES.items():
@@ -163,7 +167,7 @@ def main(
             opened = name
         for one in function.split():
             tf = None if one == "-" else functions / one if (functions / one).exists() else one
-            table = one.endswith(".label.json")
+            table = one.endswith("-labels.json")
             distance = "mean-spacing" if one.endswith(".json") and not table else None
             for kind in kinds:
                 number, light, rule = KINDS[kind]
