@@ -4,7 +4,7 @@ python benchmarks/page.py SCENES.tsv DATA FUNCTIONS -o page.csv [--scene NAME] [
     [--pictures FOLDER]
 python benchmarks/page.py --table page.csv
 
-Needs Chromium, node and npm, as `make viewers` does. Options of a scene are --spacing, --layer and --labels, its
+Needs Chromium, node and npm, as `make viewers` does. A scene's options are --spacing, --crop, --layer and --labels, its
 functions are files in FUNCTIONS or names, separated by spaces; "-": its own look. "first" and "rest" are PSNR in dB of
 one frame and of 8 jittered ones, on strips of the first view of an orbit, as WebGL in software is slow. The kind "cut"
 shows the upper half of x (of an upright volume), by a box on the page and by --crop. A function in a -labels.json file
@@ -75,12 +75,14 @@ LOOK = """(async () => {
 
 
 def reading_and_look(options: str, data: Path) -> tuple[Reading, Look]:
-    """What a scene's options say: --spacing X Y Z, --layer (files in ``data``) and --labels."""
+    """What a scene's options say: --spacing X Y Z, --crop, --layer (files in ``data``) and --labels."""
     words, reading, look = shlex.split(options), Reading(), Look()
     while words:
         option = words.pop(0)
         if option == "--spacing":
             reading["spacing"] = tuple(float(words.pop(0)) for _ in range(3))
+        elif option == "--crop":
+            reading["crop"] = words.pop(0)
         elif option == "--layer":
             look = replace(look, layers=(*look.layers, str(data / words.pop(0))))
         else:

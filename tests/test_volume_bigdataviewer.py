@@ -145,6 +145,14 @@ def test_registrations(tmp_path: Path, recwarn, affine: str, spacing: tuple, ori
     np.testing.assert_allclose(volume.axes, [[0, -1, 0], [1, 0, 0], [0, 0, 1]] if turned else np.eye(3))
 
 
+def test_an_unknown_unit_is_said(tmp_path: Path) -> None:
+    source = write(tmp_path, "hdf5")
+    xml = Path(source).with_suffix(".xml")
+    xml.write_text(re.sub("<unit>.*?</unit>", "<unit>furlong</unit>", xml.read_text()))
+    with pytest.warns(UserWarning, match="'furlong' is not a known unit of length; numbers are kept"):
+        assert read_volume(str(xml), ReadOptions(component=0, time=1)).unit == ""
+
+
 def test_tiles_are_images(tmp_path: Path) -> None:
     path = write(tmp_path, "hdf5", tiles=True)
     refused(SeveralArrays, r"2 images: 0 'tile 0' \(DAPI\); 1 'tile 1'.*--series", read_volume, path)

@@ -47,6 +47,7 @@ def test_heights_ascend_and_what_is_missing_is_nan(tmp_path: Path) -> None:
 def test_a_single_level_lies_on_degrees(tmp_path: Path) -> None:
     volume = read_volume(put(tmp_path, message(field(500), shortName="t", level=500)))
     assert (volume.spacing[:2], volume.origin[0] % 360, volume.origin[1]) == ((10, 10), 350, 30)
+    assert (volume.quantity, volume.value_unit) == ("Temperature", "K")
     one = {"Ni": 1, "longitudeOfLastGridPointInDegrees": 350, "shortName": "t"}  # a section along a meridian
     source = put(tmp_path, *(message(field(p)[:, :1], **one, level=p) for p in (1000, 850)))
     found = read_volume(source, ReadOptions(spacing=SPACING)).data

@@ -288,6 +288,29 @@ def test_inviwo_lies(tmp_path: Path, fields: dict, message: str) -> None:
     refused(DataError, message, read_volume, write(tmp_path / "v.dat", dat(fields)))
 
 
+def test_inviwo_of_voreen_and_units(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
+    (tmp_path / "v.raw").write_bytes(VALUES.astype(">i2").tobytes())
+    fields = {"Resolution": "5 4 1", "ObjectModel": "RGB", "ByteOrder": "big-endian"}
+    volume = read_volume(write(tmp_path / "a.dat", dat(fields)), ReadOptions(component=1))
+    np.testing.assert_array_equal(volume.data, VALUES.reshape(1, 4, 5, 3)[..., 1])
+    source = write(tmp_path / "b.dat", dat({"Resolution": "5 4 1", "NumFrames": 3, "ByteOrder": "bigEndian"}))
+    np.testing.assert_array_equal(read_volume(source, ReadOptions(component=2)).data, VALUES[2:])
+    assert not recwarn
+    said = {"ValueName": "Density", "ValueUnit": "HU", "Axis1Unit": "mm", "Axis2Unit": "mm", "Axis3Unit": "um"}
+    volume = read_volume(write(tmp_path / "c.dat", dat({"Spacing": "1 2 3000", **said})))
+    assert (volume.quantity, volume.value_unit, volume.unit, volume.spacing) == ("Density", "HU", "mm", (1, 2, 3))
+    read_volume(write(tmp_path / "d.dat", dat({"TransformMatrix": "row0 2 0 0 0"})))
+    assert "TransformMatrix is not read" in str(recwarn.pop().message)
+
+
+@pytest.mark.parametrize("name", ["v.mhd", "v.nhdr", "v.dat"])
+def test_data_longer_than_declared_are_said(tmp_path: Path, recwarn: pytest.WarningsRecorder, name: str) -> None:
+    (tmp_path / "v.raw").write_bytes(VALUES.tobytes() + bytes(60))
+    header = {"v.mhd": meta({}), "v.nhdr": nrrd({"data file": "v.raw"}), "v.dat": dat({})}[name]
+    np.testing.assert_array_equal(read_volume(write(tmp_path / name, header)).data, VALUES)
+    assert "v.raw: 60 bytes behind the values that its header declares are not read" in str(recwarn.pop().message)
+
+
 VGI = (
     "{volume1}\n[representation]\nsize = 5 4 3\nmirror = 0 0 0 0\ndatatype = unsigned integer\nbitsperelement = 8\n"
     "[file1]\nRegionOfInterestStart = 0 0 0\nRegionOfInterestEnd = 4 3 2\nSkipHeader = 2\nFileFormat = raw\n"

@@ -150,7 +150,7 @@ def test_cube(tmp_path: Path, sign: int, unit: float) -> None:
         assert volume.data[i, j, k] == pytest.approx(GRID[i, j, k, 0], rel=1e-6)
         expected = unit * np.array([-2 + 0.5 * i, 1 + 0.25 * j + 0.1 * k, 0.5 + k])
         np.testing.assert_allclose(place(volume, i, j, k), expected, atol=1e-6)
-    assert volume.preset == "density"
+    assert (volume.preset, volume.unit) == ("density", "angstrom")
 
 
 def test_text_takes_the_memory_of_its_values(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -197,7 +197,7 @@ def test_dx(tmp_path: Path, form: str) -> None:
     volume = read_volume(str(tmp_path / "v.dx"))
     np.testing.assert_allclose(volume.data, values, rtol=1e-6)
     np.testing.assert_allclose(place(volume, 2, 1, 3), [-1, 1.55, 3.5], atol=1e-6)
-    assert volume.preset == "density"
+    assert (volume.preset, volume.unit) == ("density", "angstrom")
 
 
 def test_dx_as_another_library_writes_it(tmp_path: Path) -> None:

@@ -158,6 +158,43 @@ def test_packed_frames_of_an_nd2(tmp_path: Path) -> None:
         np.testing.assert_array_equal(volume.data[1:5], values[0, 1, 1:5])
 
 
+# ---- signs and sizes
+
+
+def test_stacks_that_run_downwards(tmp_path: Path) -> None:
+    pytest.importorskip("liffile")
+    pytest.importorskip("nd2")
+    h5py, values, down = pytest.importorskip("h5py"), cells(channels=1), (*SPACING[:2], -SPACING[2])
+    (tmp_path / "a.lif").write_bytes(microscopes.lif([("only", values)], down, (0, 0, 9)))
+    (tmp_path / "a.nd2").write_bytes(microscopes.nd2(values, spacing=down))
+    microscopes.write_ims(tmp_path / "a.ims", values)
+    with h5py.File(tmp_path / "a.ims", "r+") as file:
+        image = file["DataSetInfo/Image"].attrs
+        image["ExtMin2"], image["ExtMax2"] = image["ExtMax2"], image["ExtMin2"]
+    for name, first in (("a.lif", 9.0), ("a.nd2", 0.0), ("a.ims", 6.0)):
+        volume = read_volume(str(tmp_path / name))
+        np.testing.assert_array_equal(volume.data, values[0, 0])
+        np.testing.assert_allclose(volume.affine[:3, 2:], [[0, 0], [0, 0], [-SPACING[2], first]], atol=1e-6)
+
+
+def test_sizes_that_are_assumed_are_said(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
+    pytest.importorskip("nd2")
+    h5py, values = pytest.importorskip("h5py"), cells(channels=1)
+    (tmp_path / "a.nd2").write_bytes(microscopes.nd2(values, spacing=(0.2, 0.2, 0.0)))
+    for name, key, value in (("a.ims", "ExtMax2", b"-0.75"), ("b.ims", "Unit", b"px")):
+        microscopes.write_ims(tmp_path / name, values)
+        with h5py.File(tmp_path / name, "r+") as file:
+            file["DataSetInfo/Image"].attrs[key] = np.frombuffer(value, "S1")
+    for name, axes, size in (("a.nd2", "z", "0.2"), ("a.ims", "z", "0.2"), ("b.ims", "x, y, z", "1")):
+        recwarn.clear()
+        read_volume(str(tmp_path / name))
+        assert f"{name}: no voxel size along {axes}; taken as {size} (--spacing" in " ".join(
+            str(w.message) for w in recwarn
+        )
+        read_volume(str(tmp_path / name), ReadOptions(spacing=(1, 1, 1)))
+        assert sum("no voxel size" in str(w.message) for w in recwarn) == 1
+
+
 # ---- levels
 
 

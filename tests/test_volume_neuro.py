@@ -254,6 +254,23 @@ def test_minc_1_as_vtk_writes_it(tmp_path: Path, code: str) -> None:
     assert volume.space == "RAS"
 
 
+@pytest.mark.parametrize(("unit", "scale", "said"), [(b"um", 1e-3, 0), (b"cm", 10.0, 0), (b"px", 1.0, 1)])
+def test_minc_lengths_are_in_its_units(
+    tmp_path: Path, recwarn: pytest.WarningsRecorder, unit: bytes, scale: float, said: int
+) -> None:
+    netcdf = pytest.importorskip("netCDF4")
+    with netcdf.Dataset(tmp_path / "v.mnc", "w", format="NETCDF3_CLASSIC") as file:
+        for axis, n in (("zspace", 3), ("yspace", 4), ("xspace", 5)):
+            file.createDimension(axis, n)
+            file.createVariable(axis, "i4", ()).setncatts(
+                {"varid": "MINC standard variable", "units": unit.decode(), "step": -2.0, "start": 7.0}
+            )
+        file.createVariable("image", "f4", ("zspace", "yspace", "xspace"))[:] = VALUES.transpose(2, 1, 0)
+    affine = read_volume(str(tmp_path / "v.mnc")).affine
+    np.testing.assert_allclose(affine[:3], scale * np.array([[-2, 0, 0, 7], [0, -2, 0, 7], [0, 0, -2, 7]]))
+    assert sum("'px' is not a known unit" in str(w.message) for w in recwarn) == said
+
+
 def test_minc_1_without_steps(tmp_path: Path) -> None:
     (tmp_path / "v.mnc").write_bytes((MINC / "minc1_1_scale.mnc").read_bytes().replace(b"step", b"stop"))
     assert read_volume(str(tmp_path / "v.mnc")).spacing == pytest.approx((1, 1, 1))

@@ -9,6 +9,7 @@ import pytest
 from tests.refused import refused
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume import ReadOptions, Volume, read_volume
+from vvgt_cli.volume.label_maps import recognised
 
 TYPES = ["u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8"]
 VALUES = np.random.default_rng(2).integers(0, 100, (5, 4, 3))  # nibabel's axes: x, y, z
@@ -137,6 +138,14 @@ def test_a_fourth_axis_of_vectors_is_not_time(tmp_path: Path, intent: str | int,
     np.testing.assert_allclose(norm.data, np.linalg.norm(values, axis=3).T, rtol=1e-6)
     np.testing.assert_array_equal(read_volume(str(tmp_path / "v.nii"), ReadOptions(component=2)).data, values[..., 2].T)
     refused(UsageError, "1 time step", read_volume, str(tmp_path / "v.nii"), ReadOptions(time=1))
+
+
+@pytest.mark.parametrize(("code", "labels"), [("i2", True), ("f4", False)])
+def test_labels_by_their_intent(tmp_path: Path, code: str, labels: bool) -> None:
+    image = nib.Nifti1Image(np.arange(60).reshape(3, 4, 5).astype(code) % 3, np.eye(4))
+    image.header.set_intent("label")
+    nib.save(image, tmp_path / "v.nii")
+    assert recognised(read_volume(str(tmp_path / "v.nii"))) == labels
 
 
 def test_pair(tmp_path: Path) -> None:

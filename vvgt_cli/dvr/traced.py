@@ -201,7 +201,10 @@ def _filtered(at: np.ndarray, total: np.ndarray, begun: np.ndarray, grid: Sequen
 
 
 def _means(sums: np.ndarray) -> np.ndarray:
-    """Return means (3, cz, cy, cx) of sums (6, cz, cy, cx) of paths, their squares, number and squared weights."""
+    """Return means (3, cz, cy, cx) of sums (6, cz, cy, cx) of paths, their squares, number and squared weights.
+
+    On coarser grids the last counts a path that is shared by nodes as several: these are trusted more.
+    """
     paths = np.maximum(sums[4], 1e-30)
     mean = sums[:3] / paths
     if sums[0].size <= 8:
@@ -214,8 +217,8 @@ def _means(sums: np.ndarray) -> np.ndarray:
     below = _means(half)
     for axis in (1, 2, 3):
         below = _doubled(below, axis, sums.shape[axis])
-    noise = np.maximum(sums[3] / paths - mean.mean(axis=0) ** 2, 0) * sums[5] / paths**2
-    differs = (mean.mean(axis=0) - below.mean(axis=0)) ** 2
+    differs = (mean.mean(axis=0) - below.mean(axis=0)) ** 2  # a single path has no variance of its own
+    noise = (np.maximum(sums[3] / paths - mean.mean(axis=0) ** 2, 0) + differs) * sums[5] / paths**2
     share = np.where(sums[4] > 0, differs / np.maximum(differs + 2 * noise, 1e-30), 0)
     below += share * (mean - below)
     return below

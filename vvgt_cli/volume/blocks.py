@@ -117,14 +117,14 @@ def read_head(path: Path, size: int) -> tuple[bytes, str]:
 
 def load_block(
     path: Path, dtype: np.dtype, shape: tuple[int, ...], *,
-    offset: int = 0, encoding: str = "raw", skip: int = 0, packed: bool = False,
+    offset: int = 0, encoding: str = "raw", skip: int = 0, packed: bool = False, alone: bool = False,
 ) -> np.ndarray:  # fmt: skip
     """Load the block of ``shape`` and ``dtype`` at byte ``offset`` of a file.
 
     ``dtype`` is with its byte order, ``shape`` slowest first. -1 as ``offset`` means that the block ends the file (raw
     only); ``skip`` counts decompressed bytes. ``encoding`` is ``raw`` (memory-mapped, read-only), ``gzip``, ``zlib``,
     ``bzip2`` or ``text``. ``packed``: slices are read front to back, so that a large compressed block of three axes may
-    stay in its file.
+    stay in its file. ``alone``: a message says of bytes behind a raw block, which the file should not hold.
 
     Returns:
         `np.memmap` for ``raw``, else an array in memory, or `Packed`.
@@ -141,6 +141,9 @@ def load_block(
         offset += skip
         if need < 1 or offset < 0 or offset + need > size:
             raise _too_short(path, size, shape, dtype, max(offset, 0))
+        if alone and (behind := size - offset - need):
+            more = f"{path}: {size_text(behind)} behind the values that its header declares are not read"
+            warnings.warn(f"{more}; check sizes, type and components", stacklevel=3)
         return np.memmap(path, dtype=dtype, mode="r", offset=offset, shape=shape)
     if encoding == "text":
         if count(shape) > size:

@@ -41,9 +41,11 @@ def whole_numbers(stored: np.ndarray, volume: Volume) -> np.ndarray:
     """Return the labels (m,), ascending, that ``stored`` values (n,) of a volume stand for.
 
     Raises:
-        Unsuitable: fractions, or more than `MAX_LABELS`.
+        Unsuitable: fractions, more than `MAX_LABELS`, or integers that float64 does not tell apart.
     """
     values = np.unique(volume.slope * stored + volume.intercept)
+    if volume.data.dtype.kind in "iu" and np.abs(values).max(initial=0) >= 2**53:
+        raise Unsuitable(f"{volume.name}: labels of 2^53 or more, which would be merged; renumber them from 0")
     if len(values) > MAX_LABELS:
         raise Unsuitable(f"{volume.name}: more than {MAX_LABELS} different values; expected a label map")
     if (odd := values[values != np.round(values)]).size:

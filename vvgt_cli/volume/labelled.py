@@ -364,7 +364,7 @@ def _named(
     Flags are labels if values are stored as integers (``dtype``) and no unit, no scale and no bits are stated.
     """
     long, standard, unit = (printable(text_of(attributes.get(key, ""))).strip()[:40] for key in NAMING[:3])
-    unit = "" if unit in ("1", "none", "unitless", "dimensionless") else unit
+    unit = "" if unit in ("1", "none", "unitless", "dimensionless", "unknown", "~") else unit
     segments = None
     flags = {"flag_values", "flag_meanings"} <= attributes.keys() and "flag_masks" not in attributes
     if flags and dtype.kind in "iu" and not unit and _scaling(attributes, source) == (1, 0):

@@ -48,17 +48,21 @@ def grib_volume(path: Path, options: ReadOptions) -> Volume:
             here = _grid(codes, message, source)
             check_memory(4 * len(levels) * here[0].size * here[1].size, source)
             codes.codes_set(message, "missingValue", MISSING)
+            title, value_unit = (codes.codes_get(message, key) for key in ("name", "units"))
             values = np.asarray(codes.codes_get_values(message)).reshape([a.size for a in here])
             planes.append(np.where(values == MISSING, np.nan, values).astype(np.float32))
             codes.codes_release(message)
             if planes[1:] and any(np.any(a.centres != b.centres) for a, b in zip(axes, here, strict=True)):
                 raise DataError(f"{source}: {name} has levels on different grids; expected one")
             axes = here
+        attributes = {"long_name": title, "units": value_unit}
         unit = _UNITS.get(name.split("/")[1], "m" if "height" in name else "level")
         heights = np.array(sorted(levels)) * (-1.0 if down else 1.0)
         axes = [Axis("level", len(planes), heights, unit, "z"), *axes]
         plain, block = replace(options, time=None), np.stack(planes)
-        return labelled_volume(block, block.dtype, axes, {}, plain, f"{source}:{name}", f"{volume_name(path)}:{name}")
+        return labelled_volume(
+            block, block.dtype, axes, attributes, plain, f"{source}:{name}", f"{volume_name(path)}:{name}"
+        )
 
 
 def _grid(codes: Any, message: Any, source: str) -> list[Axis]:

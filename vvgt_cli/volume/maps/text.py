@@ -77,9 +77,8 @@ def read_cube(path: Path, options: ReadOptions) -> Volume:
         label = f"the cube of orbitals {listing}"
     field, _ = select_component(block, options.component, str(path), label=label)
     unit = 1.0 if min(sizes) < 0 else BOHR
-    return placed(
-        field, unit * np.array(steps[::-1]), unit * np.array(origin), options, volume_name(path), preset=DENSITY
-    )
+    place, facts = (unit * np.array(steps[::-1]), unit * np.array(origin)), {"preset": DENSITY, "unit": "angstrom"}
+    return placed(field, *place, options, volume_name(path), **facts)
 
 
 def _orbitals(file: IO[bytes], path: Path) -> list[str]:
@@ -123,7 +122,7 @@ def read_dx(path: Path, options: ReadOptions) -> Volume:
         )
     block = _dx_values(keys, counts, path, start)
     field, _ = select_component(block, options.component, str(path))
-    return placed(field, steps[::-1], origin, options, volume_name(path), preset=DENSITY)
+    return placed(field, steps[::-1], origin, options, volume_name(path), preset=DENSITY, unit="angstrom")
 
 
 def _dx_values(keys: list[str], counts: list[int], path: Path, start: int) -> np.ndarray:

@@ -121,4 +121,5 @@ def _load(fields: HeaderFields, source: Path, dtype: np.dtype, shape: tuple[int,
         if header == -1:
             raise DataError(f"{fields.name}: HeaderSize -1 with compressed data; expected 0 or more")
         return load_block(source, dtype, shape, offset=start + header, encoding="zlib")
-    return load_block(source, dtype, shape, offset=-1 if header == -1 else start + header)
+    offset = -1 if header == -1 else start + header
+    return load_block(source, dtype, shape, offset=offset, alone=start == 0)

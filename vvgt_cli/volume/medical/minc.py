@@ -20,6 +20,7 @@ from vvgt_cli.volume.arrays.netcdf import check_header
 from vvgt_cli.volume.libraries import need, read_part
 from vvgt_cli.volume.readers import HDF5, volume_name
 from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, magnitude, placed, select_component, text_of
+from vvgt_cli.volume.space import MILLIMETRE, metres, one_unit
 from vvgt_cli.volume.stored import Slices, give_back, stored_or_loaded
 
 IMAGE, DIMENSIONS = "minc-2.0/image/0/", "minc-2.0/dimensions/"
@@ -200,7 +201,7 @@ def _number(attributes: dict[str, Any], key: str, default: float) -> float:
 
 
 def _place(axes: dict[str, dict[str, Any]], names: tuple[str, ...], path: Path) -> tuple[list[list[float]], np.ndarray]:
-    """Return the vectors of a step along x, y and z, one a row, and the first position: steps, starts and cosines."""
+    """Return the vectors of a step along x, y and z, one a row, and the first position, in mm."""
     rows, origin = [], np.zeros(3)
     for name in names[::-1]:  # fastest first
         stated = axes.get(name, {})
@@ -208,6 +209,8 @@ def _place(axes: dict[str, dict[str, Any]], names: tuple[str, ...], path: Path) 
             raise DataError(f"{path}: axis {name} has irregular steps; expected regular ones: try mincresample")
         unit = np.eye(3)[AXES.index(name)]
         cosines = np.asarray(stated.get("direction_cosines", unit), np.float64).reshape(3)
+        _, unit = one_unit([text_of(stated.get("units", "")).strip("_\0 ")], str(path), True)
+        cosines = cosines * (metres(unit) or MILLIMETRE) / MILLIMETRE
         rows.append((cosines * _number(stated, "step", 1.0)).tolist())
         origin += cosines * _number(stated, "start", 0.0)
     if not np.isfinite(rows).all() or not np.isfinite(origin).all():

@@ -31,6 +31,7 @@ _SPM = {130: "i1", 132: "u2", 136: "u4"}
 _COLORS = {128: 3, 2304: 4}  # bytes a voxel
 _OTHERS = {1: "bits", 32: "complex64", 1536: "128-bit floats", 1792: "complex128", 2048: "complex256"}
 _VECTORS = {*range(1004, 1011), 2003, 2004, *range(2006, 2010), 2016, 2017}  # intents (nifti1.h, FSL's) of components
+_LABELS = 1002  # NIFTI_INTENT_LABEL
 HEADER = 540  # bytes of the longer one
 
 
@@ -51,6 +52,7 @@ class Header:
     samples: int = 0  # bytes of a voxel that is a colour
     start: float = 0.0  # of time, in its unit
     time_unit: str = ""  # where the header states one
+    labels: bool = False  # values are, by the intent
 
 
 def parse_header(head: bytes, name: str) -> Header:
@@ -99,6 +101,7 @@ def parse_header(head: bytes, name: str) -> Header:
         _COLORS.get(code, 0),
         start,
         {8: "s", 16: "ms", 24: "us"}.get(units & 0x38, ""),
+        intent == _LABELS and code in _DTYPES and np.dtype(_DTYPES[code]).kind in "iu",
     )
 
 
@@ -164,6 +167,7 @@ def read_nifti(path: Path, options: ReadOptions) -> Volume:
     head, encoding = read_head(path, HEADER)
     header = parse_header(head, str(path))
     volume = _volume(header, path, encoding, options)
+    volume = replace(volume, segments=()) if header.labels else volume
     if not header.single:
         return volume
     text = read_head(path, min(header.offset, MAX_HEADER))[0]

@@ -233,7 +233,9 @@ def read_nrrd(path: Path, options: ReadOptions) -> Volume:
         if skip == -1:
             return load_block(source, dtype, part, offset=-1)
         start, whole = _line_skip(source, start, fields.integer("lineskip", 0)), packed and part == shape
-        return load_block(source, dtype, part, offset=start, encoding=encoding, skip=skip, packed=whole)
+        return load_block(
+            source, dtype, part, offset=start, encoding=encoding, skip=skip, packed=whole, alone=source != path
+        )
 
     named = fields.get("datafile")
     several = _data_names(path, named, len(sizes)) if named is not None else None

@@ -22,7 +22,7 @@ from vvgt_cli.volume.blocks import read_head
 from vvgt_cli.volume.microscopy.image import MAX_XML, choose_channel, choose_image, safe_xml
 from vvgt_cli.volume.readers import HEAD_BYTES, lazy
 from vvgt_cli.volume.reading import ReadOptions, Volume, magnitude, need, printable
-from vvgt_cli.volume.space import metres, placed, unit_name
+from vvgt_cli.volume.space import one_unit, placed
 from vvgt_cli.volume.stored import loaded
 
 READ = {  # by the XML element that names the data: reader, and the array of time t, setup s and level l
@@ -181,7 +181,8 @@ def _view(bdv: _Dataset, time: int, setup: _Setup, options: ReadOptions) -> Volu
     shift = (np.array(volume.origin) - finest.origin) / finest.spacing
     matrix, name = _affine(bdv, time, setup), f"{bdv.data.stem}:{setup.name or setup.number}"
     steps, origin = (matrix[:3, :3] * factor).T, (matrix @ [*shift, 1.0])[:3]
-    return placed(data, steps, origin, options, name, unit=setup.unit)
+    _, unit = one_unit([setup.unit], str(bdv.source), options.spacing is not None)
+    return placed(data, steps, origin, options, name, unit=unit)
 
 
 def _affine(bdv: _Dataset, time: int, setup: _Setup) -> np.ndarray:
@@ -253,7 +254,7 @@ def _setup(element: Element, channels: dict[str | None, str]) -> _Setup:
         raise ValueError(f"sizes {spacing}, {size}")
     name = channel if channel and (not name or name.isdigit()) else name
     image = ", ".join(f"{key} {value}" for key, value in facts.items()) or "image"
-    unit = unit_name(metres(element.findtext("voxelSize/unit", "")))
+    unit = element.findtext("voxelSize/unit", "")[:40]
     return _Setup(int(element.findtext("id", "")), name[:80], image[:80], size, spacing, unit)
 
 

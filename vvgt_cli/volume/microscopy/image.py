@@ -19,7 +19,7 @@ import numpy as np
 from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, UsageError
 from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory
 from vvgt_cli.volume.components import contiguous, listed, magnitude
-from vvgt_cli.volume.reading import ReadOptions, Volume
+from vvgt_cli.volume.reading import ReadOptions, Volume, placed
 from vvgt_cli.volume.stored import Slices, stored_or_loaded
 
 EXTRA = "microscopy"
@@ -38,13 +38,14 @@ class Micrograph:
         dtype: of the values.
         read: (time, channel, slices along z, y, x, step 1) to that box, (z, y, x).
         chunks: (z, y, x) voxels that are read together.
-        spacing: (x, y, z) in micrometres; None of an axis where the file has none.
+        spacing: (x, y, z) in micrometres, negative where an axis runs backwards; None where the file has none.
         origin: world position of the centre of voxel (0, 0, 0), (x, y, z), micrometres.
         names: of the channels, where the file has any.
         colors: RGB in [0, 1] of the channels, where the file has any.
         rgb: the channels are red, green, blue and perhaps opacity.
         samples: the channels are samples of pixels, not channels of their own, as those of ``rgb`` are.
         mapped: ``read`` gives views of the file, which take no memory.
+        tells: a message says what is taken for spacing that is None.
     """
 
     times: int
@@ -60,6 +61,7 @@ class Micrograph:
     rgb: bool = False
     samples: bool = False
     mapped: bool = False
+    tells: bool = True
 
 
 def picture_volume(picture: Micrograph, options: ReadOptions, source: str, name: str) -> Volume:
@@ -93,10 +95,15 @@ def picture_volume(picture: Micrograph, options: ReadOptions, source: str, name:
             check_memory(size * picture.dtype.itemsize, source, IN_BLOCKS)
             field = contiguous(field)
     unit = "" if picture.spacing == (None, None, None) else "um"
-    x, y, z = (s if s is not None and math.isfinite(s) and s > 0 else None for s in picture.spacing)
-    across = x or y or z or 1.0  # of an axis without a size
-    spacing = options.spacing_or((x or across, y or across, z or across))
-    return Volume(field, spacing, picture.origin, name=name, unit=unit)
+    sizes = [s if s is not None and math.isfinite(s) else 0.0 for s in picture.spacing]
+    across = next((abs(s) for s in sizes if s), 1.0)  # of an axis without a size
+    unknown = [axis for axis, s, n in zip("xyz", sizes, field.shape[::-1], strict=True) if not s and n > 1]
+    if unknown and picture.tells and options.spacing is None:
+        axes = ", ".join(unknown)
+        warnings.warn(
+            f"{source}: no voxel size along {axes}; taken as {across:g} (--spacing X Y Z sets it)", stacklevel=3
+        )
+    return placed(field, np.diag([s or across for s in sizes]), picture.origin, options, name, unit=unit)
 
 
 def choose_channel(

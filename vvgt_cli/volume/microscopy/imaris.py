@@ -88,13 +88,13 @@ def _text(value: Any) -> str:
 
 def _placed(image: Any, shape: tuple[int, int, int]) -> tuple[Any, Any]:
     """Return spacing and origin (x, y, z) in micrometres by the extent of the image."""
-    unit = (metres(_text(image.get("Unit", "um"))) or MICROMETRE) / MICROMETRE
+    unit = (metres(_text(image.get("Unit", "")) or "um") or np.nan) / MICROMETRE
     spacing: list[float | None] = []
     origin = []
     for axis, size in enumerate(reversed(shape)):
         ends = [[float(word) for word in _text(image.get(f"Ext{end}{axis}", "")).split()] for end in ("Min", "Max")]
         width = (ends[1][0] - ends[0][0]) * unit / size if all(len(e) == 1 for e in ends) else 0.0
-        known = np.isfinite(width) and width > 0
+        known = np.isfinite(width) and width != 0
         spacing.append(width if known else None)
         origin.append(ends[0][0] * unit + width / 2 if known else 0.0)
     return tuple(spacing), tuple(origin)

@@ -85,7 +85,7 @@ def _picture(image: Any, path: Path) -> Micrograph:
 
 
 def _placed(image: Any) -> tuple[Any, Any]:
-    """Return spacing and origin (x, y, z) in micrometres by the lengths of the axes, from first to last voxel."""
+    """Return spacing and origin (x, y, z) in micrometres by the lengths from first to last voxel, which have signs."""
     spacing: dict[str, float] = {}
     origin: dict[str, float] = {}
     for axis in image.xml_element.findall("./Data/Image/ImageDescription/Dimensions/DimensionDescription"):
@@ -95,8 +95,8 @@ def _placed(image: Any) -> tuple[Any, Any]:
         if name and unit:
             first, length = float(axis.get("Origin", 0)) * unit, float(axis.get("Length", 0)) * unit
             if size > 1 and np.isfinite(length) and length:
-                spacing[name] = abs(length) / (size - 1)
-            origin[name] = min(first, first + length) if np.isfinite(first + length) else 0.0
+                spacing[name] = length / (size - 1)
+            origin[name] = first if np.isfinite(first) else 0.0
     return tuple(spacing.get(a) for a in "xyz"), tuple(origin.get(a, 0.0) for a in "xyz")
 
 

@@ -44,7 +44,11 @@ def read_nd2(path: Path, options: ReadOptions) -> Volume:
             if attributes.compressionType == "lossless"
             else None
         )
-        x, y, z = (float(v) for v in file.voxel_size())
+        known = next((c.volume.axesCalibrated for c in file.metadata.channels or ()), (False,) * 3)
+        x, y, z = (float(v) if ok else None for v, ok in zip(file.voxel_size(), known, strict=True))
+        stack = next((one.parameters for one in file.experiment if one.type == "ZStackLoop"), None)
+        if z and stack and (stack.stepUm < 0) == stack.bottomToTop:
+            z = -z
         several = sizes.get("C", 1) > 1
         read = _reader(path, sizes, loops, place, np.dtype(file.dtype), packed)
         picture = Micrograph(

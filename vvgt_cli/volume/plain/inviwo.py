@@ -6,6 +6,7 @@ Fields as Inviwo's DatVolumeSequenceReader reads them.
 from __future__ import annotations
 
 import re
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,8 +14,8 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import data_file, load_block
-from vvgt_cli.volume.headers import MAX_HEADER, HeaderFields, type_of
-from vvgt_cli.volume.reading import ReadOptions, Volume, placed, select_component, volume_name
+from vvgt_cli.volume.headers import MAX_HEADER, HeaderFields, printable, type_of
+from vvgt_cli.volume.reading import ReadOptions, Volume, one_unit, placed, select_component, volume_name
 
 
 def _fields(path: Path) -> HeaderFields:
@@ -33,8 +34,9 @@ def _format(fields: HeaderFields) -> tuple[np.dtype, int]:
     dtype = None if match is None else type_of(match[2], {"ushort12": "u2"})  # the last: Voreen's
     if match is None or dtype is None:
         raise DataError(f"{fields.name}: Format {fields['format']!r}; expected as UINT8, FLOAT32 or Vec3FLOAT32")
-    big = fields.get("byteorder", "").lower() == "bigendian"
-    return dtype.newbyteorder(">" if big else "<"), int(match[1] or 1)
+    big = fields.get("byteorder", "").lower().replace("-", "") == "bigendian"
+    channels = {"la": 2, "rgb": 3, "rgba": 4}.get(fields.get("objectmodel", "").lower(), 1)  # Voreen's
+    return dtype.newbyteorder(">" if big else "<"), int(match[1] or channels)
 
 
 def _scaling(fields: HeaderFields) -> tuple[float, float]:
@@ -73,18 +75,26 @@ def read_inviwo(path: Path, options: ReadOptions) -> Volume:
     if len(dims) != 3:
         raise DataError(f"{path}: Resolution {dims}; expected three numbers")
     dtype, channels = _format(fields)
-    steps, offset = fields.integer("sequences", 1), fields.integer("byteoffset", 0)
+    steps, offset = fields.integer("sequences", fields.integer("numframes", 1)), fields.integer("byteoffset", 0)
     if steps < 1 or offset < 0:
         raise DataError(f"{path}: Sequences {steps}, ByteOffset {offset}; expected at least 1, and 0 or more")
     source = data_file(path, fields.need("rawfile", "objectfilename"))
-    block = load_block(source, dtype, (steps, *reversed(dims), channels), offset=offset)
+    block = load_block(source, dtype, (steps, *reversed(dims), channels), offset=offset, alone=True)
     block = np.moveaxis(block, 0, -1).reshape(*reversed(dims), -1) if steps > 1 else block[0]
     field, (slope, intercept) = select_component(block, options.component, str(path), scaling=_scaling(fields))
-    vectors, facts = _vectors(fields, dims), {"slope": slope, "intercept": intercept}
-    volume = placed(field, vectors, (0.0, 0.0, 0.0), options, volume_name(path), **facts)
+    if "transformmatrix" in fields:
+        warnings.warn(f"{path}: its TransformMatrix is not read", stacklevel=2)
+    factors, unit = one_unit(
+        [fields.get(f"axis{k}unit", "") for k in (1, 2, 3)], str(path), options.spacing is not None
+    )
+    quantity, value_unit = (printable(fields.get(key, ""))[:40] for key in ("valuename", "valueunit"))
+    volume = placed(
+        field, _vectors(fields, dims) * np.reshape(factors, (3, 1)), (0.0, 0.0, 0.0), options, volume_name(path),
+        slope=slope, intercept=intercept, unit=unit, quantity=quantity, value_unit=value_unit,
+    )  # fmt: skip
     edges = volume.affine[:3, :3]
     if fields.get("offset"):
-        origin = np.array(fields.floats("Offset", fields["offset"], 3)) + edges @ (0.5, 0.5, 0.5)
+        origin = np.array(fields.floats("Offset", fields["offset"], 3)) * factors + edges @ (0.5, 0.5, 0.5)
     else:
         origin = edges @ (0.5 - np.array(dims) / 2) + 0.0
     return replace(volume, origin=tuple(origin.tolist()))

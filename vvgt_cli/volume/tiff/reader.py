@@ -110,7 +110,7 @@ def read_tiff(path: Path, options: ReadOptions, slices: int = 1) -> Volume:
             layout.count("T"), layout.count("CS"), sizes, np.dtype(series.dtype),
             partial(_read, layout, np.dtype(series.dtype), cache(again), Lock(), mapped), (1, *sizes[1:]),
             facts.spacing, names=facts.channels, colors=facts.colors, rgb=layout.color, samples=bool(layout.of("S")),
-            mapped=mapped is not None,
+            mapped=mapped is not None, tells=False,
         )  # fmt: skip
         if slices:
             _warn_of_unread(series.keyframe.tags, facts, options, path)
