@@ -19,7 +19,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.arrays.beside import Neighbour, choose_grid, warn_of_curvilinear, with_neighbours
-from vvgt_cli.volume.labelled import axis, described_by, flags_of, labelled_volume
+from vvgt_cli.volume.labelled import DESCRIBES, axis, described_by, flags_of, labelled_volume
 from vvgt_cli.volume.reading import ReadOptions, Volume, load_block, need, volume_name
 
 _TURN = Lock()  # the library is not for several threads
@@ -107,7 +107,11 @@ def _choose(file: Any, wanted: str | None, path: Path) -> Any:
         prefix, group = groups.pop(0)
         variables |= {prefix + name: variable for name, variable in group.variables.items()}
         groups += [(f"{prefix}{name}/", inner) for name, inner in group.groups.items()]
-    described = {name for variable in variables.values() for name in described_by(variable.__dict__)}
+    described = {
+        name
+        for variable in variables.values()
+        for name in described_by({key: variable.getncattr(key) for key in DESCRIBES if key in variable.ncattrs()})
+    }  # of other attributes, the library cannot read all
     fits = {
         name: variable
         for name, variable in variables.items()

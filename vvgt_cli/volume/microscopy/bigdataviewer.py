@@ -18,7 +18,6 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError, VvgtError
-from vvgt_cli.volume.blocks import read_head
 from vvgt_cli.volume.microscopy.image import MAX_XML, choose_channel, choose_image, safe_xml
 from vvgt_cli.volume.readers import HEAD_BYTES, lazy
 from vvgt_cli.volume.reading import ReadOptions, Volume, magnitude, need, printable
@@ -117,8 +116,9 @@ def _of_data(path: Path, tell: bool) -> _Dataset | None:
     views = {view[:2] for view in map(_view_of, names) if view}
     if not views:
         return None
-    for xml in sorted(path.resolve().parent.glob("*.xml")):
-        mine = xml.is_file() and b"<SpimData" in read_head(xml, HEAD_BYTES)[0]
+    for xml in sorted(filter(Path.is_file, path.resolve().parent.glob("*.xml"))):
+        with open(xml, "rb") as file:
+            mine = b"<SpimData" in file.read(HEAD_BYTES)
         if mine and (bdv := _described(xml)).data.resolve() == path.resolve():
             return replace(bdv, source=path)
     if tell:

@@ -182,7 +182,10 @@ def _numbers(text: str, n: int, path: Path, what: str) -> list[float]:
 
 def extent_of(text: str, path: Path, what: str = "WholeExtent") -> np.ndarray:
     """Parse an extent, (3, 2) int64: first and last point along x, y and z; raise DataError for anything else."""
-    return np.array([int(e) for e in _numbers(text, 6, path, what)], np.int64).reshape(3, 2)
+    ends = np.array(_numbers(text, 6, path, what))
+    if not (np.abs(ends) < 1 << 31).all():
+        raise DataError(f"{path}: {what} is {text!r}; expected 6 integers of 32 bits")
+    return ends.astype(np.int64).reshape(3, 2)
 
 
 def image_grid(image: dict[str, str], where: str, path: Path) -> Grid:
@@ -377,7 +380,8 @@ class _Blocks:
             if k not in kept:
                 part = packed[int(self.begins[k]) - begin : int(self.begins[k + 1]) - begin]
                 kept.clear()
-                need, kept[k] = min(self.each, self.size - k * self.each), unpack(self.coding, part, self.each + 1)
+                need = min(self.each, self.size - k * self.each)
+                kept[k] = unpack(self.coding, part, need + 1)
                 if len(kept[k]) != need:
                     raise ValueError(f"a block of {len(kept[k])} bytes where {need} are expected")
             parts.append(kept[k])
