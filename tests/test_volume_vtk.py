@@ -237,6 +237,17 @@ def test_vti_lies(tmp_path: Path, capfd: pytest.CaptureFixture[str], old: bytes,
     assert capfd.readouterr() == ("", ""), "VTK must not print"
 
 
+@pytest.mark.parametrize("compressor", ["ZLib", "LZ4"])
+def test_a_block_is_unpacked_no_further_than_its_values_reach(tmp_path: Path, compressor: str) -> None:
+    path = Path(write_vti(tmp_path / "v.vti", image(a=VALUES.astype("u1")), compressor=compressor))
+    body = path.read_bytes()
+    begin = body.index(b"_", body.index(b"<AppendedData")) + 1
+    count, _, last, _ = struct.unpack_from("<4I", body, begin)
+    assert (count, last) == (1, VALUES.size)
+    path.write_bytes(body[: begin + 4] + struct.pack("<I", (1 << 31) - 1) + body[begin + 8 :])
+    np.testing.assert_array_equal(read_volume(str(path)).data, VALUES.astype("u1"))
+
+
 def test_vti_of_fewer_voxels_than_it_stores(tmp_path: Path) -> None:
     path = Path(write_vti(tmp_path / "v.vti", image(a=VALUES.astype("f8"))))
     path.write_bytes(path.read_bytes().replace(b"0 4 0 3 0 2", b"0 4 0 3 0 1"))
