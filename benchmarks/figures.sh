@@ -18,11 +18,11 @@ only "$@" >"$out/scenes.tsv"
 "$python" benchmarks/reports.py "$out/scenes.tsv" "$data" "$functions" -o "$out/reports" -- \
   --steps 56 --steps 152 --picture-size 200 ${REPORT:-}
 [ -f "$out/dvr-vtk.csv" ] || "$python" benchmarks/dvr_vtk.py "$out/scenes.tsv" "$data" "$functions" -o "$out/dvr-vtk.csv"
-while IFS=$'\t' read -r name volume options function; do
+while IFS=$'\037' read -r name volume options function; do # not tabs, of which several count as one
   # shellcheck disable=SC2086  # several words, or none
   [ -f "$out/files/$name.ply" ] || "$python" -m vvgt_cli.commands.main convert "$data/$volume" $options \
     --tf "$functions/$function" --opacity-unit-distance mean-spacing -q -o "$out/files/$name.ply"
-done <"$out/scenes.tsv"
+done < <(tr '\t' '\037' <"$out/scenes.tsv")
 [ -f "$out/share.csv" ] ||
   "$python" benchmarks/share.py "$out/scenes.tsv" "$data" "$functions" "$out/files" -o "$out/share.csv"
 
