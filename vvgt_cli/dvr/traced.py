@@ -16,8 +16,8 @@ RAYS = 1 << 18  # that are cast at once
 MOST_RAYS = 1 << 23
 POINTS = 16  # a cell that views see
 MOST_PATHS = 1 << 20
-TRIES = 8  # scatterings of a ray that are looked for
-FAINTEST = 1e-3  # colour of a ray below which nobody sees what it loses
+TRIES = 8  # times that a ray is cast, to find where it is scattered
+FAINTEST = 1e-3  # colour of a ray, in [0, 1], below which nobody sees what it loses
 SEED = 1
 
 
@@ -110,8 +110,8 @@ def light_grid(matter: Scattering, sky: Sky, shape: Sequence[int], cell: int) ->
     """Return the light that views see matter in, (3, cz, cy, cx) float32, to the power that colours are in.
 
     Rays from all around say which places views see, as often as they see them, and a path from each brings light, whose
-    mean a cell takes. Views add up colours to the power of 1 / `GAMMA`, which makes them darker than the light along a
-    ray is where it or the matter's colour vary: cells are brighter by what the rays that see them lose.
+    mean a cell takes. Views add up colours to the power of 1 / `GAMMA`, and are darker than the light along a ray where
+    it or the matter's colour varies. Cells are made brighter by as much as the rays that see them lose.
 
     Args:
         matter: what scatters.
@@ -133,10 +133,11 @@ def light_grid(matter: Scattering, sky: Sky, shape: Sequence[int], cell: int) ->
 
 
 def _gain(rays: np.ndarray, at: np.ndarray, paths: np.ndarray, light: np.ndarray) -> np.ndarray:
-    """Return by how much views show light (cz, cy, cx, 3) too dark in its cells, of the same shape.
+    """Return the factor (cz, cy, cx, 3) that makes views as bright as the light along their rays.
 
-    What paths (n, 7) bring to the places of a ray is summed as light is, and what the cells hold there as views add it
-    up. The latter's mean over few places is too large as a power, by what their variance says.
+    Along each ray, the light that paths bring is averaged as light is, and the light of the grid as views add it up. A
+    cell takes the ratio of the rays that are scattered in it. The power of a mean over few places is too large, by a
+    term in its variance, which is taken off.
 
     Args:
         rays: numbers (n,) of the rays that see the places.
@@ -158,10 +159,10 @@ def _gain(rays: np.ndarray, at: np.ndarray, paths: np.ndarray, light: np.ndarray
     shown = np.maximum(along_ray(color), FAINTEST)
     variance = np.maximum(along_ray(color**2) / shown**2 - 1, 0) / np.maximum(places - 1, 1)
     added = shown**GAMMA * (1 - np.minimum(GAMMA * (GAMMA - 1) / 2 * variance, 0.5))
-    lost = np.where(shown > FAINTEST, along_ray(paths[:, 4:] * paths[:, :3]) / added, 1)
+    ratio = np.where(shown > FAINTEST, along_ray(paths[:, 4:] * paths[:, :3]) / added, 1)
     weight = (color * added).mean(axis=1) * (count[ray] > 1) + 1e-9
     weight /= TRIES * weight.mean()
-    return _filtered(at, np.column_stack([lost, lost.mean(axis=1) ** 2]) * weight[:, None], weight, grid)
+    return _filtered(at, np.column_stack([ratio, ratio.mean(axis=1) ** 2]) * weight[:, None], weight, grid)
 
 
 def _seen(matter: Scattering, grid: Sequence[int], cell: int) -> tuple[np.ndarray, np.ndarray]:
@@ -225,7 +226,7 @@ def _means(sums: np.ndarray) -> np.ndarray:
 
 
 def _halved(fine: np.ndarray, axis: int, near: float, far: float) -> np.ndarray:
-    """Return sums at every second node of an axis, of those at all, by the weights of interpolation."""
+    """Return sums at every second node along an axis, gathered from all nodes by the weights of interpolation."""
     fine = np.moveaxis(fine, axis, 0)
     even, odd = fine[::2], fine[1::2]
     out = near * even
@@ -240,7 +241,7 @@ def _halved(fine: np.ndarray, axis: int, near: float, far: float) -> np.ndarray:
 
 
 def _doubled(coarse: np.ndarray, axis: int, count: int) -> np.ndarray:
-    """Return values at ``count`` nodes of an axis, interpolated between every second."""
+    """Return values at ``count`` nodes along an axis, interpolated from every second node."""
     coarse = np.moveaxis(coarse, axis, 0)
     edged = np.concatenate([coarse[:1], coarse, coarse[-1:]])
     out = np.empty((2 * len(coarse), *coarse.shape[1:]))

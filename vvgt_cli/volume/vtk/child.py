@@ -42,7 +42,7 @@ IDLE, LOOK = 60.0, 2.0  # s without any processor time after which it counts as 
 STOPPED = {-getattr(signal, name, -1 << 30) for name in ("SIGXCPU", "SIGKILL")}  # exit statuses; no others on Windows
 ERRORS = (SeveralSteps, SeveralArrays, SeveralComponents)  # with attributes, which go from process to process
 KEYS = ("dims", "spacing", "array", "component", "time")
-SAID = ("name", "quantity", "value_unit", "unit")
+DESCRIPTION = ("name", "quantity", "value_unit", "unit")
 MAX_ROWS = 50  # of steps, arrays or blocks each that `contents_of` lists
 LARGEST = 1 << 20  # bytes of the line of an answer
 
@@ -51,7 +51,7 @@ def volume_by_child(program: str, path: Path, options: ReadOptions) -> Volume:
     """Read a file of `vtk.programs.PROGRAMS`, of an index, or of a mesh or grid as a volume."""
     facts, values = _asked(program, path, options, "volume")
     place = {key: tuple(facts[key]) for key in ("spacing", "origin", "direction")}
-    return Volume(values, **{key: facts[key] for key in SAID}, **place)  # type: ignore[arg-type]  # three numbers each
+    return Volume(values, **{key: facts[key] for key in DESCRIPTION}, **place)  # type: ignore[arg-type]  # three numbers each
 
 
 def read_indexed(path: Path, options: ReadOptions) -> Volume:
@@ -221,7 +221,7 @@ def _work(program: str, path: Path, options: ReadOptions, task: str) -> tuple[di
     values = np.ascontiguousarray(volume.data)
     place = {key: [float(v) for v in getattr(volume, key)] for key in ("spacing", "origin", "direction")}
     return {
-        **{key: getattr(volume, key) for key in SAID},
+        **{key: getattr(volume, key) for key in DESCRIPTION},
         "dtype": values.dtype.str,
         "shape": values.shape,
         **place,
