@@ -71,7 +71,14 @@ KINDS = {
     "steep, lit": (SourceRequest(volume_of((50, 61, 40)), tf=STEEP, light=LIT), 3e-3),
     "labels": (SourceRequest(labels_of((50, 61, 40)), labels="auto"), 3e-3),
     "labels, lit": (SourceRequest(labels_of((50, 61, 40)), labels="auto", light=LIT), 3e-3),
-}
+    "layers": (
+        SourceRequest(
+            volume_of((50, 61, 40)), tf=STEEP, light=LIT,
+            layers=(SourceRequest(volume_of((25, 30, 20), (2.0, 2.0, 2.0))), SourceRequest(labels_of((50, 61, 40)))),
+        ),
+        3e-3,
+    ),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -12,13 +12,17 @@ import tifffile
 import vvgt_cli as library
 from tests.refused import refused
 from tests.test_labels import SMALL, balls
+from vvgt_cli.cameras import default_views
+from vvgt_cli.dvr import RenderSettings, render_view, render_view_reference
 from vvgt_cli.dvr.layers import Layer, common_grid, grid_of, same_grid
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.layered import ALL, open_content
 from vvgt_cli.field.source import SourceRequest, load, parse_layer
 from vvgt_cli.gaussians import read_ply
+from vvgt_cli.images.metrics import psnr
 from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.labels import distinct
+from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.volume import ReadOptions, Volume, read_volume
 from vvgt_cli.volume.options import crop, masked, parse_crop
 
@@ -361,6 +365,41 @@ def test_a_layer_is_placed_by_its_affine() -> None:
     target = common_grid(layers)
     assert target is first
     np.testing.assert_allclose(grid_of(layers, target), grid_of([Layer(exact, function, 1.0)], exact), atol=1e-5)
+
+
+def band(middle: float, width: float, rgb: tuple[float, float, float], opacity: float = 0.9) -> TransferFunction:
+    x = middle + width * np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
+    heights = PiecewiseOpacity(x, np.array([0.0, 0.0, opacity, 0.0, 0.0]))
+    return TransferFunction("band", heights, ColorMap(x[[0, 4]], np.array([rgb, rgb])))
+
+
+@pytest.mark.parametrize("light", ["none", "headlight"])
+@pytest.mark.parametrize("other", ["scalars", "labels"])
+def test_rays_classify_scalars_between_voxels(other: str, light: str) -> None:
+    """Shells thinner than the values' steps between voxels, which a grid of classified voxels shows as rings."""
+    z, y, x = np.mgrid[:20, :20, :20]
+    r = np.sqrt((x - 9.3) ** 2 + (y - 9.8) ** 2 + (z - 10.1) ** 2)
+    ball = Volume((100 - 8 * r).astype(np.float32), (1.0, 1.2, 0.9))
+    corner = Volume(((x > 11) & (y > 11) & (r < 8)).astype(np.uint8) * 2, (1.0, 1.2, 0.9))
+    beside = {"scalars": SourceRequest(ball, band(40, 4, (0.2, 0.5, 1.0), 0.3)), "labels": SourceRequest(corner)}
+    opacity = 0.9 if other == "scalars" else 0.5
+    request = SourceRequest(ball, band(60, 3, (1.0, 0.5, 0.2), opacity), layers=(beside[other],))
+    scene = load(replace(request, light=LightOptions((light,)))).scene()
+    camera = default_views("train", size=48)[3]
+    shown = render_view(scene, camera, RenderSettings(samples=1))
+    twin = render_view_reference(scene, camera, step=0.03)
+    assert twin[..., 3].mean() > 0.3
+    assert psnr(shown, twin) > 50  # 32 to 34 of a grid of classified voxels
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 3e38])
+def test_layers_with_values_that_are_none_or_huge_stay_finite(value: float) -> None:
+    first = cloud((9, 9, 9))
+    first.data[4, 4, 4] = value
+    request = SourceRequest(first, ramp(0.2, 0.9), layers=(SourceRequest(cloud((9, 9, 9)), ramp(0.5, 0.6)),))
+    for light in ("none", "headlight"):
+        scene = load(replace(request, light=LightOptions((light,)))).scene()
+        assert np.isfinite(render_view(scene, default_views("train", size=40)[0])).all()
 
 
 def test_the_grid_is_as_fine_as_the_finest_layer() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vvgt_cli.dvr.layout import BRICK
+from vvgt_cli.dvr.layout import BRICK, Mixture
 from vvgt_cli.jit.decorators import parallel_kernel
 from vvgt_cli.jit.threads import ThreadSlice, iterations
 from vvgt_cli.look.tables import Optics
@@ -102,6 +102,14 @@ def empty_distance(ranges: np.ndarray, tables: Optics) -> np.ndarray:
         distance[grown & ~active] = d
         active = grown
     return distance
+
+
+def empty_bricks(values: np.ndarray, tables: Optics, mixture: Mixture | None = None) -> np.ndarray:
+    """Return `empty_distance` of ``values`` (nz, ny, nx) and of what a mixture's scalars show between voxels."""
+    empty = empty_distance(brick_ranges(values), tables)
+    for scalars, optics in mixture.fields() if mixture else ():
+        np.minimum(empty, empty_distance(brick_ranges(scalars), optics), out=empty)
+    return empty
 
 
 def dilate(mask: np.ndarray) -> np.ndarray:

@@ -87,7 +87,7 @@ def _point(u: float, optics: Optics) -> Quad:
 
 
 @_jit
-def _mean(u0: float, u1: float, optics: Optics) -> Quad:
+def mean_quad(u0: float, u1: float, optics: Optics) -> Quad:
     """Average (tau r, tau g, tau b, tau) while the table coordinate goes linearly from u0 to u1."""
     width = u1 - u0
     if abs(width) < 0.5:
@@ -97,8 +97,8 @@ def _mean(u0: float, u1: float, optics: Optics) -> Quad:
 
 @_jit
 def mean_optics(u0: float, u1: float, optics: Optics) -> tuple[float, float, float, float]:
-    """Return `_mean` as a tuple."""
-    mean = _mean(u0, u1, optics)
+    """Return `mean_quad` as a tuple."""
+    mean = mean_quad(u0, u1, optics)
     return lane(mean, 0), lane(mean, 1), lane(mean, 2), lane(mean, 3)
 
 
@@ -133,7 +133,7 @@ def absorbed(depth: float) -> float:
 @_jit
 def composite(u0: float, u1: float, dt: float, optics: Optics, light: Quad, trans: float) -> tuple[Quad, float]:
     """Return ``light`` (r, g, b, alpha) and ``trans`` behind a segment of length dt, along which u0 goes to u1."""
-    segment = scale(dt, _mean(u0, u1, optics))
+    segment = scale(dt, mean_quad(u0, u1, optics))
     depth = max(lane(segment, 3), 0.0)
     if depth <= SUB_DEPTH or abs(u1 - u0) < 0.5:
         f = absorbed(depth) * trans
@@ -141,7 +141,7 @@ def composite(u0: float, u1: float, dt: float, optics: Optics, light: Quad, tran
     parts = min(int(depth / SUB_DEPTH) + 1, PARTS)
     width = (u1 - u0) / parts
     for part in range(parts):
-        mean = _mean(u0 + part * width, u0 + (part + 1) * width, optics)
+        mean = mean_quad(u0 + part * width, u0 + (part + 1) * width, optics)
         segment = scale(dt / parts, mean)
         depth = max(lane(segment, 3), 0.0)
         f = absorbed(depth) * trans

@@ -5,23 +5,26 @@ from __future__ import annotations
 import itertools
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
+from vvgt_cli.dvr.layout import Mixture
 from vvgt_cli.errors import DataError
 from vvgt_cli.look import LabelTable, TransferFunction
-from vvgt_cli.look.tables import extinction
+from vvgt_cli.look.tables import Optics, build_tables, extinction
 from vvgt_cli.volume import Volume, triple
 from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.stored import read_block
 
 SAME = 1e-3  # voxels up to which two grids are one
 SLAB = 16  # slices that are laid out at once
+MAX_SCALARS = 7  # layers of scalars that rays classify, what `march` has room for; of more, voxels are
+FARTHEST = 1e30  # coordinate in a table: none is infinite
 MAX_FINER = 8  # times along an axis that a layer's voxels may refine the first volume's
-VOXEL_BYTES = 20  # of a scene: four float32, and extinction again
+VOXEL_BYTES = 20  # of a scene: four float32, and extinction again; and four for each layer of scalars
 
 
 @dataclass(frozen=True)
@@ -131,7 +134,7 @@ def common_grid(layers: Sequence[Layer], stored: bool = False) -> Volume:
     shape = tuple(int(n * f) for n, f in zip(first.data.shape, finer[::-1], strict=True))
     spacing = triple(float(s / f) for s, f in zip(first.spacing, finer, strict=True))
     if not stored:
-        check_memory(VOXEL_BYTES * math.prod(shape), first.name)
+        check_memory((VOXEL_BYTES + 4 * len(_scalars(layers))) * math.prod(shape), first.name)
     origin = tuple((first.affine @ [*((1 / finer - 1) / 2), 1.0])[:3].tolist())
     empty = np.broadcast_to(np.uint8(0), shape)
     return replace(first, data=empty, spacing=spacing, origin=origin, slope=1.0, intercept=0.0)
@@ -167,13 +170,76 @@ def grid_box(layers: Sequence[Layer], target: Volume, lo: np.ndarray, hi: np.nda
     for layer in layers:
         if same_grid(layer.volume, target):
             out += layer.box(lo, hi)
+        elif layer.interpolated:
+            out += layer.classify(_values_in(layer, target, lo, hi))
         else:
-            _placed(layer, target, lo, hi, out)
+            out += _placed(layer, target, lo, hi, layer.box, 0.0).astype(np.float32)
     return out
 
 
-def _placed(layer: Layer, target: Volume, lo: np.ndarray, hi: np.ndarray, out: np.ndarray) -> None:
-    """Add the part of a layer on another grid; of it what the box meets is read, with a voxel around."""
+def mixture_box(
+    layers: Sequence[Layer], tables: Sequence[Optics], target: Volume, lo: np.ndarray, hi: np.ndarray,
+    texels: np.ndarray, per_unit: float,
+) -> Mixture:  # fmt: skip
+    """Return voxels ``lo`` to ``hi`` (3,) of ``target``, x first, as rays meet them.
+
+    ``tables``: `scalar_tables` of the layers; ``texels``: their `grid_box` per unit-frame length; ``per_unit``: world
+    lengths per unit-frame length.
+    """
+    if not tables:
+        return Mixture.of(texels)
+    inner = _scalars(layers)
+    others = [layer for layer in layers if all(layer is not one for one in inner)]
+    out = np.empty((len(inner), *texels.shape[:3]), np.float32)
+    for layer, own, values in zip(inner, tables, out, strict=True):
+        places = (_values_in(layer, target, lo, hi) - own.lo) * own.inv_width
+        values[:] = np.where(np.isfinite(places), np.clip(places, -FARTHEST, FARTHEST), np.nan)
+    rest = grid_box(others, target, lo, hi) * np.float32(per_unit) if others else np.zeros((1, 1, 1, 4), np.float32)
+    return Mixture.of(rest, out, tables)
+
+
+def _scalars(layers: Sequence[Layer]) -> list[Layer]:
+    """Return the layers that rays interpolate before they classify them."""
+    return [layer for layer in layers if layer.interpolated][:MAX_SCALARS]
+
+
+def scalar_tables(layers: Sequence[Layer], per_unit: float, voxel: float) -> list[Optics]:
+    """Return tables of one length over the data values of the layers that rays interpolate before they classify them.
+
+    ``per_unit``: world lengths per unit-frame length; ``voxel``: mean edge of a voxel in the latter.
+    """
+
+    def made(layer: Layer, bins: int | None) -> Optics:
+        assert isinstance(layer.tf, TransferFunction)
+        ends = -math.inf, math.inf
+        return build_tables(
+            layer.tf, ends, unit_distance=layer.unit_distance, world_per_unit=per_unit, voxel=voxel, bins=bins
+        )
+
+    bins = max((made(layer, None).bins for layer in _scalars(layers)), default=0)
+    return [made(layer, bins) for layer in _scalars(layers)]
+
+
+def _values_in(layer: Layer, target: Volume, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
+    """Return a layer's data values at voxels ``lo`` to ``hi`` of ``target``: (z, y, x) float64, NaN outside of it."""
+    volume = layer.volume
+
+    def read(first: np.ndarray, last: np.ndarray) -> np.ndarray:
+        return volume.slope * read_block(volume, first, last)[..., None].astype(np.float64) + volume.intercept
+
+    values = read(lo, hi) if same_grid(volume, target) else _placed(layer, target, lo, hi, read, np.nan)
+    return values[..., 0]
+
+
+def _placed(
+    layer: Layer, target: Volume, lo: np.ndarray, hi: np.ndarray,
+    read: Callable[[np.ndarray, np.ndarray], np.ndarray], outside: float,
+) -> np.ndarray:  # fmt: skip
+    """Return a layer on another grid, interpolated at voxels ``lo`` to ``hi`` of ``target``: (z, y, x, c) float64.
+
+    ``read`` returns (z, y, x, c) of a box of the layer's voxels; of them what the target's box meets is read, with a
+    voxel around. ``outside`` is the value beyond the layer's box.
+    """
     from vvgt_cli.dvr.place import place
 
     matrix = np.ascontiguousarray((np.linalg.inv(layer.volume.affine) @ target.affine)[:3])
@@ -182,15 +248,8 @@ def _placed(layer: Layer, target: Volume, lo: np.ndarray, hi: np.ndarray, out: n
     first = np.clip(np.floor(met.min(axis=0)).astype(np.int64) - 1, 0, dims)
     last = np.clip(np.ceil(met.max(axis=0)).astype(np.int64) + 2, 0, dims)
     if (last <= first).any():
-        return
-    about = lo.astype(np.int64), first.astype(np.int64), dims.astype(np.int64)
-    if not layer.interpolated:
-        colors = np.zeros(out.shape)
-        place(layer.box(first, last).astype(np.float64), matrix, *about, 0.0, colors)
-        out += colors.astype(np.float32)
-        return
-    volume = layer.volume
-    values = volume.slope * read_block(volume, first, last).astype(np.float64) + volume.intercept
-    scalars = np.zeros((*out.shape[:3], 1), np.float64)
-    place(values[..., None], matrix, *about, np.nan, scalars)
-    out += layer.classify(scalars[..., 0])
+        return np.full((*(hi - lo)[::-1], 1), outside)
+    values = read(first, last).astype(np.float64)
+    out = np.zeros((*(hi - lo)[::-1], values.shape[3]))
+    place(values, matrix, lo.astype(np.int64), first.astype(np.int64), dims.astype(np.int64), outside, out)
+    return out

@@ -5,8 +5,9 @@ segments of equal length dt between its entry into the box at t0 and its exit; s
 of a volume cut rays into the same segments, and the block in which a segment's middle lies owns it, so that what the
 blocks show of a ray composes, front to back, to what the whole ray shows.
 
-Arguments: ``voxels`` and ``optics`` are `layout.Voxels` and `layout.Optics`; ``texels`` (`layout.Texels`) is an optics
-grid or None, and then ``voxels`` and ``optics`` hold the grid's extinction; ``light`` (`layout.Light`) or None;
+Arguments: ``voxels`` and ``optics`` are `layout.Voxels` and `layout.Optics`; ``mixture`` is None, or the
+`layout.Mixture` of an optics grid, of which ``voxels`` and ``optics`` then hold the extinction; ``light`` is None or a
+`layout.Light`;
 ``empty`` (bz, by, bx) uint8 as `Scene.empty`. Which of them are None is known when a kernel is compiled: each of the
 eight kernels holds one loop.
 """
@@ -20,25 +21,33 @@ from typing import Any, Concatenate, ParamSpec
 import numpy as np
 
 from vvgt_cli.dvr.kernel import (
+    FAINT,
+    FINER,
     FLAGS,
     OPAQUE,
+    PARTS,
+    SUB_DEPTH,
     TILE,
     U,
     Vector,
+    absorbed,
     any_light,
     blend_texels,
     box_span,
     inverse,
     is_flat,
+    mean_quad,
     pass_segment,
+    sample,
     skip,
+    table_coordinate,
     texel_at,
     values_met,
 )
-from vvgt_cli.dvr.layout import LIT, LIT_GRID, TUPLES, Light, Optics, Texels, Voxels
-from vvgt_cli.dvr.runs import RUN, sample_run, stack_run
+from vvgt_cli.dvr.layout import LIT, LIT_GRID, TUPLES, Light, Mixture, Optics, Voxels
+from vvgt_cli.dvr.runs import RUN, Run, sample_run, stack_run
 from vvgt_cli.dvr.shading import shading
-from vvgt_cli.dvr.vectors import Quad, lane, zeros4
+from vvgt_cli.dvr.vectors import Quad, add, lane, scale, vector, zeros4
 from vvgt_cli.jit.decorators import inlined, parallel_kernel
 from vvgt_cli.jit.threads import ThreadSlice, iterations, next_iteration
 
@@ -131,13 +140,84 @@ def _through_values(
 
 
 @_jit
-def _through_texels(
-    texels: Texels, voxels: Voxels, empty: np.ndarray, light: Any, p: Vector, d: Vector,
+def _layer(mixture: Mixture, k: int) -> Optics:
+    """Return the tables of layer ``k`` of scalars."""
+    even = mixture.even[k]
+    return Optics(0.0, 1.0, mixture.nodes[k], mixture.cumulative[k], even, even, even)
+
+
+@_jit
+def _sample_layers(mixture: Mixture, x: float, y: float, z: float, out: Run) -> Quad:
+    """Write the table coordinate of each layer of scalars at voxel coordinates, -1: unknown; return the texel there."""
+    for k in range(mixture.scalars.shape[0]):
+        out[k] = table_coordinate(sample(mixture.scalars[k], x, y, z), _layer(mixture, k))
+    return texel_at(mixture.grid, x, y, z)
+
+
+@_jit
+def _layer_mean(mixture: Mixture, k: int, u0: float, u1: float) -> Quad:
+    """Return `mean_quad` of layer ``k`` of scalars; zeros where an end is unknown."""
+    return mean_quad(u0, u1, _layer(mixture, k)) if min(u0, u1) >= 0.0 else zeros4()
+
+
+@_jit
+def _pass_layers(
+    mixture: Mixture, p: Vector, d: Vector, t: float, dt: float, a: Quad, b: Quad, then: Run, now: Run, within: Run,
+    own: Any, seen: Quad, trans: float,
+) -> tuple[Quad, float, float]:  # fmt: skip
+    """Return `pass_segment` of a mixture with scalars, from texel ``a`` and coordinates ``then`` to ``b`` and ``now``.
+
+    ``then`` becomes ``now``, ``within`` is overwritten. ``own`` is None, or is filled with (r, g, b, alpha) of each
+    layer of scalars and, behind them, of the texels.
+    """
+    count, whole, place = mixture.scalars.shape[0], trans, 0.0
+    total, steep = scale(0.5, add(a, b)), False
+    for k in range(count):
+        total = add(total, _layer_mean(mixture, k, then[k], now[k]))
+        low, high = min(then[k], now[k]), max(then[k], now[k])
+        if low >= 0.0 and high > mixture.even[k, U(int(low))]:
+            steep = True
+    parts = min(int(dt * lane(total, 3) / SUB_DEPTH) + 1, PARTS)
+    if steep and trans >= FAINT:
+        parts = max(parts, FINER)
+    if own is not None:
+        for n in range(4 * count + 4):
+            own[n] = 0.0
+    (px, py, pz), (dx, dy, dz), part = p, d, dt / parts
+    for n in range(1, parts + 1):
+        s, c = t + n * part, b
+        if n < parts:
+            c = _sample_layers(mixture, px + s * dx, py + s * dy, pz + s * dz, within)
+        else:
+            for k in range(count):
+                within[k] = now[k]
+        total = scale(0.5 * part, add(a, c))
+        for k in range(count):
+            total = add(total, scale(part, _layer_mean(mixture, k, then[k], within[k])))
+        depth = max(lane(total, 3), 0.0)
+        f = absorbed(depth) * trans
+        if own is None:
+            seen = add(seen, scale(f, total))
+        else:
+            for k in range(count + 1):
+                one = scale(0.5, add(a, c)) if k == count else _layer_mean(mixture, k, then[k], within[k])
+                for n4 in range(4):
+                    own[4 * k + n4] += f * part * lane(one, n4)
+        for k in range(count):
+            then[k] = within[k]
+        a, trans, place = c, trans - f * depth, place + f * depth * (n - 0.5)
+    return seen, trans, t + part * place / (whole - trans) if whole > trans else t + 0.5 * dt
+
+
+@_jit
+def _through_mixture(
+    mixture: Mixture, voxels: Voxels, empty: np.ndarray, light: Any, p: Vector, d: Vector,
     t0: float, dt: float, first: int, last: int, step: float,
 ) -> tuple[float, float, float, float]:  # fmt: skip
-    """Return `_through_values` of an optics grid: along a segment extinction times (r, g, b, 1) is linear."""
+    """Return `_through_values` of an optics grid: along a segment the texels are linear."""
     (px, py, pz), (dx, dy, dz) = p, d
-    nz, ny, nx, _ = texels.values.shape
+    count, shape = mixture.scalars.shape[0], voxels.values.shape
+    then, now, within, parts = stack_run(), stack_run(), stack_run(), stack_run()
     seen: Quad = zeros4()
     trans, red, green, blue = 1.0, 0.0, 0.0, 0.0
     opaque = OPAQUE * min(step * step, 1.0)
@@ -148,21 +228,38 @@ def _through_texels(
     while i <= last and trans >= opaque:
         if i >= stop:
             at = i - 1 if known else i
-            start = skip((nz, ny, nx), empty, px, py, pz, dx, dy, dz, ix, iy, iz, t0, dt, per_step, last, at)
+            start = skip(shape, empty, px, py, pz, dx, dy, dz, ix, iy, iz, t0, dt, per_step, last, at)
             if start >= last:
                 break
             if start > at:
                 known, i = False, start
             stop = i + LEAP
         t = t0 + i * dt
-        b = texel_at(texels.values, px + t * dx, py + t * dy, pz + t * dz)
-        if known and lane(a, 3) + lane(b, 3) > 0.0:
-            if light is None:
+        b = _sample_layers(mixture, px + t * dx, py + t * dy, pz + t * dz, now)
+        here, ahead = t - dt, trans
+        if not known:
+            for k in range(count):
+                then[k] = now[k]
+        elif light is None:
+            if count > 0:
+                seen, trans, _ = _pass_layers(mixture, p, d, here, dt, a, b, then, now, within, None, seen, trans)
+            elif lane(a, 3) + lane(b, 3) > 0.0:
                 seen, trans = blend_texels(a, b, dt, seen, trans)
-            else:
-                ahead = trans
-                own, trans = blend_texels(a, b, dt, zeros4(), trans)
-                r, g, b_ = shade_segment(own, light, voxels.values, p, d, look, t - 0.5 * dt, t - dt, dt, ahead)
+        else:
+            own, s = zeros4(), t - 0.5 * dt
+            if count > 0:
+                _, trans, s = _pass_layers(mixture, p, d, here, dt, a, b, then, now, within, parts, own, trans)
+                for k in range(count):
+                    own = vector(parts[4 * k], parts[4 * k + 1], parts[4 * k + 2], parts[4 * k + 3])
+                    if lane(own, 3) > 0.0:
+                        r, g, b_ = shade_segment(own, light, mixture.scalars[k], p, d, look, s, here, dt, ahead)
+                        red, green, blue = red + r, green + g, blue + b_
+                k = 4 * count
+                own = vector(parts[k], parts[k + 1], parts[k + 2], parts[k + 3])
+            elif lane(a, 3) + lane(b, 3) > 0.0:
+                own, trans = blend_texels(a, b, dt, own, trans)
+            if lane(own, 3) > 0.0:
+                r, g, b_ = shade_segment(own, light, voxels.values, p, d, look, s, here, dt, ahead)
                 red, green, blue = red + r, green + g, blue + b_
         a, known = b, True
         i += 1
@@ -173,19 +270,19 @@ def _through_texels(
 
 @_jit
 def _march(
-    voxels: Voxels, optics: Optics, texels: Any, empty: np.ndarray, light: Any, p: Vector, d: Vector,
+    voxels: Voxels, optics: Optics, mixture: Any, empty: np.ndarray, light: Any, p: Vector, d: Vector,
     t0: float, dt: float, first: int, last: int, step: float,
 ) -> tuple[float, float, float, float]:  # fmt: skip
     """Return premultiplied (r, g, b, alpha) of the segments from ``first`` to before ``last`` of a ray."""
-    if texels is None:
+    if mixture is None:
         return _through_values(voxels, optics, empty, light, p, d, t0, dt, first, last, step)
     else:  # noqa: RET505 - numba leaves out the branch that is not taken
-        return _through_texels(texels, voxels, empty, light, p, d, t0, dt, first, last, step)
+        return _through_mixture(mixture, voxels, empty, light, p, d, t0, dt, first, last, step)
 
 
 @_jit
 def _whole(
-    voxels: Voxels, optics: Optics, texels: Any, empty: np.ndarray, light: Any, p: Vector, d: Vector, step: float
+    voxels: Voxels, optics: Optics, mixture: Any, empty: np.ndarray, light: Any, p: Vector, d: Vector, step: float
 ) -> tuple[float, float, float, float]:
     """Return premultiplied (r, g, b, alpha) along a ray; ``step`` is the sampling distance in voxels."""
     nz, ny, nx = voxels.values.shape
@@ -194,7 +291,7 @@ def _whole(
     if not t1 > t0:
         return 0.0, 0.0, 0.0, 0.0
     count = max(math.ceil((t1 - t0) * math.sqrt(dx * dx + dy * dy + dz * dz) / step), 1)
-    return _march(voxels, optics, texels, empty, light, p, d, t0, (t1 - t0) / count, 0, count, step)
+    return _march(voxels, optics, mixture, empty, light, p, d, t0, (t1 - t0) / count, 0, count, step)
 
 
 def _direction(basis: np.ndarray, lens: np.ndarray, x: float, y: float) -> Vector:
@@ -213,7 +310,7 @@ direction, exact_direction = _jit(_direction), _exact(_direction)
 
 @_jit
 def _pixel(
-    voxels: Voxels, optics: Optics, texels: Any, empty: np.ndarray, light: Any, eye: np.ndarray, basis: np.ndarray,
+    voxels: Voxels, optics: Optics, mixture: Any, empty: np.ndarray, light: Any, eye: np.ndarray, basis: np.ndarray,
     lens: np.ndarray, step: float, col: int, row: int, offsets: np.ndarray,
 ) -> tuple[float, float, float, float]:  # fmt: skip
     """Sum (r, g, b, alpha) over the rays at ``offsets`` from the centre of pixel (``col``, ``row``)."""
@@ -221,13 +318,14 @@ def _pixel(
     for ray in range(len(offsets)):
         d = direction(basis, lens, col + 0.5 + offsets[U(ray), 0], row + 0.5 + offsets[U(ray), 1])
         p = eye[0], eye[1], eye[2]
-        red, green, blue, alpha = _whole(voxels, optics, texels, empty, light, p, d, step)
+        red, green, blue, alpha = _whole(voxels, optics, mixture, empty, light, p, d, step)
         acc0, acc1, acc2, acc3 = acc0 + red, acc1 + green, acc2 + blue, acc3 + alpha
     return acc0, acc1, acc2, acc3
 
 
 def _tiles(
-    thread: ThreadSlice, voxels: Voxels, optics: Optics, texels: Texels | None, empty: np.ndarray, light: Light | None,
+    thread: ThreadSlice, voxels: Voxels, optics: Optics, mixture: Mixture | None, empty: np.ndarray,
+    light: Light | None,
     eye: np.ndarray, basis: np.ndarray, lens: np.ndarray, step: float, order: np.ndarray, offsets: np.ndarray,
     mask: np.ndarray, known: int, out: np.ndarray,
 ) -> None:  # fmt: skip
@@ -247,7 +345,7 @@ def _tiles(
                 if not mask[line, col]:
                     continue
                 red, green, blue, alpha = _pixel(
-                    voxels, optics, texels, empty, light, eye, basis, lens, step, col, line, offsets
+                    voxels, optics, mixture, empty, light, eye, basis, lens, step, col, line, offsets
                 )  # fmt: skip
                 pixel = out[line, col]
                 if known > 0:
@@ -292,7 +390,7 @@ def _ray(
 
 @_jit
 def _pixel_segments(
-    voxels: Voxels, optics: Optics, texels: Any, empty: np.ndarray, light: Any, faces: np.ndarray, begin: np.ndarray,
+    voxels: Voxels, optics: Optics, mixture: Any, empty: np.ndarray, light: Any, faces: np.ndarray, begin: np.ndarray,
     eye: np.ndarray, basis: np.ndarray, lens: np.ndarray, step: float, pixel: np.ndarray, offsets: np.ndarray,
     out: np.ndarray,
 ) -> None:  # fmt: skip
@@ -304,13 +402,14 @@ def _pixel_segments(
         d, t0, dt, first, last = _ray(faces, p, basis, lens, step, x, y)
         if first < last:
             red, green, blue, alpha = _march(
-                voxels, optics, texels, empty, light, local, d, t0, dt, first, last, step
+                voxels, optics, mixture, empty, light, local, d, t0, dt, first, last, step
             )  # fmt: skip
             out[m, 0], out[m, 1], out[m, 2], out[m, 3] = red, green, blue, alpha
 
 
 def _segments(
-    thread: ThreadSlice, voxels: Voxels, optics: Optics, texels: Texels | None, empty: np.ndarray, light: Light | None,
+    thread: ThreadSlice, voxels: Voxels, optics: Optics, mixture: Mixture | None, empty: np.ndarray,
+    light: Light | None,
     faces: np.ndarray, begin: np.ndarray, eye: np.ndarray, basis: np.ndarray, lens: np.ndarray, step: float,
     pixels: np.ndarray, offsets: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
@@ -323,7 +422,7 @@ def _segments(
     """
     for n in iterations(thread, len(pixels)):
         _pixel_segments(
-            voxels, optics, texels, empty, light, faces, begin, eye, basis, lens, step, pixels[n], offsets, out[n]
+            voxels, optics, mixture, empty, light, faces, begin, eye, basis, lens, step, pixels[n], offsets, out[n]
         )  # fmt: skip
 
 
@@ -366,9 +465,9 @@ def _kernel(
 
 render_tiles = _kernel(_tiles, "render_tiles", VIEW, "none", "none")
 render_lit_tiles = _kernel(_tiles, "render_lit_tiles", VIEW, "none", "Light")
-render_grid_tiles = _kernel(_tiles, "render_grid_tiles", VIEW, "Texels", "none")
-render_lit_grid_tiles = _kernel(_tiles, "render_lit_grid_tiles", VIEW, "Texels", "Light")
+render_grid_tiles = _kernel(_tiles, "render_grid_tiles", VIEW, "Mixture", "none")
+render_lit_grid_tiles = _kernel(_tiles, "render_lit_grid_tiles", VIEW, "Mixture", "Light")
 cast_segments = _kernel(_segments, "cast_segments", BLOCK, "none", "none")
 cast_lit_segments = _kernel(_segments, "cast_lit_segments", BLOCK, "none", "Light")
-cast_grid_segments = _kernel(_segments, "cast_grid_segments", BLOCK, "Texels", "none")
-cast_lit_grid_segments = _kernel(_segments, "cast_lit_grid_segments", BLOCK, "Texels", "Light")
+cast_grid_segments = _kernel(_segments, "cast_grid_segments", BLOCK, "Mixture", "none")
+cast_lit_grid_segments = _kernel(_segments, "cast_lit_grid_segments", BLOCK, "Mixture", "Light")

@@ -6,7 +6,8 @@ Per segment of length ds, with the scalar s at its middle (Max 1995, eq. 8, by t
 
 from __future__ import annotations
 
-from typing import cast
+from collections.abc import Iterator
+from typing import Any, cast
 
 import numpy as np
 
@@ -45,16 +46,40 @@ def optics_at(scene: Scene, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     """Return extinction (n,) per unit-frame length and colour (n, 3) at voxel coordinates (n, 3)."""
     if scene.grid is None:
         return optics(scene, trilinear(scene.volume, points))
-    values = grid_values(scene.grid, points)
+    return _parted(grid_values(scene.grid, points))
+
+
+def _parted(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return extinction (n,) and colour (n, 3) of extinction times (r, g, b, 1)."""
     return values[:, 3], values[:, :3] / np.where(values[:, 3:] > 0, values[:, 3:], 1)
 
 
-def normals(scene: Scene, points: np.ndarray) -> np.ndarray:
+def matter_at(scene: Scene, points: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Yield what rays meet at voxel coordinates (n, 3): of each layer of scalars of a mixture, and of all else.
+
+    Extinction (n,) per unit-frame length, colour (n, 3), and the values (nz, ny, nx) that have its normals.
+    """
+    if scene.mixture is None or not len(scene.mixture.scalars):
+        yield *optics_at(scene, points), scene.values
+        return
+    yield *_parted(grid_values(scene.mixture.grid, points)), scene.values
+    inner = [layer for layer in cast(Any, scene.tf).layers if layer.interpolated]
+    for layer, values in zip(inner, scene.mixture.scalars, strict=True):
+        matrix = np.linalg.inv(layer.volume.affine) @ scene.volume.affine
+        at = points @ matrix[:3, :3].T + matrix[:3, 3]
+        outside = ((at < -0.5) | (at > np.array(layer.volume.dims) - 0.5)).any(axis=1)
+        data = np.where(outside, np.nan, trilinear(layer.volume, at))
+        tau, rgb = _parted(layer.classify(data).astype(np.float64))
+        yield tau / scene.volume.unit_frame().scale, rgb, values
+
+
+def normals(scene: Scene, points: np.ndarray, values: np.ndarray | None = None) -> np.ndarray:
     """Return directions (n, 3) of the gradient, box frame, at voxel coordinates (n, 3); zeros where there is none.
 
-    Central differences of stored voxels (clamped at the edges), interpolated trilinearly.
+    Central differences of ``values`` (nz, ny, nx), by default the scene's, at voxels (clamped at the edges),
+    interpolated trilinearly.
     """
-    dims, values = scene.volume.dims, scene.values
+    dims, values = scene.volume.dims, scene.values if values is None else values
     gradient = np.zeros((len(points), 3))
     for at, weight in corners(points, dims):
         for axis in range(3):
@@ -75,14 +100,19 @@ def grid_values(grid: np.ndarray, points: np.ndarray) -> np.ndarray:
     return total
 
 
-def shade(scene: Scene, points: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the colours' factors (n, 1 or 3) and white to add (n,) at voxel coordinates (n, 3) seen along (n, 3)."""
+def shade(
+    scene: Scene, points: np.ndarray, directions: np.ndarray, values: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the colours' factors (n, 1 or 3) and white to add (n,) at voxel coordinates (n, 3) seen along (n, 3).
+
+    ``values`` (nz, ny, nx) have the normals.
+    """
     light = scene.light
     assert light is not None
     at = (points + 0.5) * light.inv_cell - 0.5
     if light.traced:
         return grid_values(light.shade.transpose(1, 2, 3, 0), at), np.zeros(len(points))
-    normal = normals(scene, points)
+    normal = normals(scene, points, values)
     known = normal.any(axis=1)
     diffuse, white = np.zeros(len(points)), np.zeros(len(points))
     for toward in [*light.directions, *([-directions] if light.head else [])]:
@@ -122,10 +152,13 @@ def march(scene: Scene, origin: np.ndarray, directions: np.ndarray, step: float)
     for begin in range(0, count, together):
         t = first + (np.arange(begin, min(begin + together, count))[:, None] + 0.5) * ds
         points = ((origin + t[..., None] * directions + scene.half) / scene.step - 0.5).reshape(-1, 3)
-        tau, rgb = optics_at(scene, points)
-        if scene.light is not None:
-            factor, white = shade(scene, points, np.tile(directions, (len(t), 1)))
-            rgb = np.minimum(factor * rgb + white[:, None], 1)
+        tau, rgb = np.zeros(len(points)), np.zeros((len(points), 3))
+        for its, own, values in matter_at(scene, points):
+            if scene.light is not None:
+                factor, white = shade(scene, points, np.tile(directions, (len(t), 1)), values)
+                own = np.minimum(factor * own + white[:, None], 1)
+            tau, rgb = tau + its, rgb + its[:, None] * own
+        rgb /= np.where(tau > 0, tau, 1)[:, None]
         alpha = -np.expm1(-tau.reshape(t.shape) * ds)
         left = np.cumprod([trans, *(1 - alpha)], axis=0)
         color += ((left[:-1] * alpha)[..., None] * rgb.reshape(*t.shape, 3)).sum(axis=0)

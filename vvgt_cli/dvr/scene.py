@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vvgt_cli.dvr.layout import Light, Texels, Voxels, pairs_fit
+from vvgt_cli.dvr.layers import Layer, mixture_box, scalar_tables
+from vvgt_cli.dvr.layout import Light, Mixture, Texels, Voxels, pairs_fit
 from vvgt_cli.dvr.light import scene_light
 from vvgt_cli.look import Lighting, Named, TransferFunction
 from vvgt_cli.look.tables import Optics, build_tables
@@ -54,8 +55,10 @@ class Scene:
         empty: (bz, by, bx) uint8 Chebyshev distance, in bricks, to the nearest brick with extinction (0: has some).
         half, step: (3,) float64 half extents and voxel edges in the unit frame, (x, y, z).
         lighting: in world axes; ``light`` the same as kernels take it; None: colours are the function's.
-        grid: (nz, ny, nx, 4) float32 extinction times (r, g, b, 1) per unit-frame length, of an optics grid: what is
-            drawn. ``values`` and ``optics`` then hold its extinction alone: what light and bricks ask for.
+        grid: (nz, ny, nx, 4) float32 extinction times (r, g, b, 1) per unit-frame length, of an optics grid, with
+            layers of scalars classified at voxels: what cells are made of, and skies' light. ``values`` and ``optics``
+            then hold its extinction alone.
+        mixture: the same as rays meet it, which classify scalars between voxels.
         labels: the grid is one of labels alone.
         rays: draws in place of the CPU's kernels (`vvgt_cli.dvr.cuda`).
     """
@@ -71,6 +74,7 @@ class Scene:
     lighting: Lighting | None = None
     light: Light | None = None
     grid: np.ndarray | None = None
+    mixture: Mixture | None = None
     labels: bool = False
     rays: Callable[..., None] | None = None
 
@@ -125,18 +129,22 @@ class Scene:
     @classmethod
     def of_grid(
         cls, volume: Volume, tf: Named, unit_distance: float, grid: np.ndarray, lighting: Lighting | None = None,
-        labels: bool = False,
+        labels: bool = False, layers: Sequence[Layer] = (),
     ) -> Scene:  # fmt: skip
-        """Build from an optics grid (nz, ny, nx, 4) float32 per world length, scaled in place, on ``volume``'s grid."""
+        """Build from an optics grid (nz, ny, nx, 4) float32 per world length, scaled in place, on ``volume``'s grid.
+
+        ``layers``: what it adds up; without them, rays interpolate the grid.
+        """
         from vvgt_cli.dvr import bricks
 
         frame = volume.unit_frame()
-        grid *= np.float32(1 / frame.scale)
+        per_unit, half, step = 1 / frame.scale, np.array(frame.half), np.array(frame.step)
+        grid *= np.float32(per_unit)
         values = read_only(grid[..., 3], grid.dtype)
-        optics = Optics.linear(float(values.max()))
-        empty = bricks.empty_distance(bricks.brick_ranges(values), optics)
-        half, step = np.array(frame.half), np.array(frame.step)
-        scene = cls(volume, tf, unit_distance, values, optics, empty, half, step, grid=grid, labels=labels)
+        optics, tables = Optics.linear(float(values.max())), scalar_tables(layers, per_unit, float(np.mean(frame.step)))
+        mixture = mixture_box(layers, tables, volume, np.zeros(3, np.int64), np.array(volume.dims), grid, per_unit)
+        empty = bricks.empty_bricks(values, optics, mixture)
+        scene = cls(volume, tf, unit_distance, values, optics, empty, half, step, None, None, grid, mixture, labels)
         return scene if lighting is None else scene.lit(lighting)
 
     def lit(self, lighting: Lighting) -> Scene:

@@ -245,8 +245,12 @@ class Blocked(Field):
             self.pictures[key] = self.pictures[key][0], one.colors
 
     def _visible_blocks(self) -> list[int]:
-        """Return the blocks with visible cells, or all blocks before the cells are integrated."""
-        if self.grid is None:
+        """Return the blocks with visible cells.
+
+        All blocks are returned before the cells are integrated, and of layers of scalars, which may be visible between
+        voxels alone.
+        """
+        if self.grid is None or self.source.mixed:
             return list(range(len(self._grid(np.zeros(3, np.int64)).blocks)))
         store = self.run_pass.store
         return [n for n in range(len(self.grid.blocks)) if len(store.load(CELLS, n, names=("counts",))["counts"])]

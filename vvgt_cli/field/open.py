@@ -42,7 +42,7 @@ from vvgt_cli.volume.stored import Stored, is_file_backed, planes
 if TYPE_CHECKING:
     from vvgt_cli.field.cells import Reader
 
-LAYOUT = 8  # version of the stored blocks: increase it whenever their content changes
+LAYOUT = 9  # version of the stored blocks: increase it whenever their content changes
 MIN_BLOCKED = 1 << 30  # bytes of values: more are processed in blocks, with a tenth of the memory (docs/log/blocks.md)
 LARGE = 0.25  # share of the free memory: smaller files are always read whole
 PROGRAM, CELL_BYTES = 3e8, 300  # bytes: interpreter, libraries and kernels; a base cell in memory
@@ -59,9 +59,9 @@ PACKED = (
     ".nd2",
     ".vtkhdf",
 )  # compressed: small files may hold many voxels
-RANGES, LAYER_VOXEL = 0.15, 20  # bytes per voxel: the map of empty space, an optics grid
+RANGES, LAYER_VOXEL = 0.15, 20  # bytes per voxel: the map of empty space, an optics grid without scalars
 OWN = {"uint8": 0, "uint16": 0, "float32": 0, "int8": 1}  # bytes per voxel of the kernels' copy; other types 4
-LAYERED_BYTES = 60  # per voxel of an optics grid while a block is in memory
+LAYERED_BYTES = 80  # per voxel of an optics grid while a block is in memory
 
 
 @dataclass(frozen=True)
@@ -354,7 +354,7 @@ def better_in_blocks(request: SourceRequest) -> bool:
         return True
     if free is None:
         return False
-    own = LAYER_VOXEL if len(volumes) > 1 else OWN.get(volumes[0].data.dtype.name, 4)
+    own = LAYER_VOXEL + 4 * len(volumes) if len(volumes) > 1 else OWN.get(volumes[0].data.dtype.name, 4)
     loaded = sum(volume.data.nbytes for volume in volumes if isinstance(volume.data, Stored))
     voxels = volumes[0].data.size
     return loaded + (own + RANGES) * voxels + PROGRAM + CELL_BYTES * min(voxels, MAX_BASE_CELLS) > free

@@ -34,14 +34,12 @@ class VolumePart:
         light: Light | None = None,
     ) -> None:  # fmt: skip
         """Read the voxels ``lo`` to ``hi`` (3,), x first, of a volume of ``dims`` voxels with this ``frame``."""
-        from vvgt_cli.dvr.bricks import brick_ranges, empty_distance
-
         halo = REACH + HALO
         self.box: VoxelBox = reader.box(np.maximum(lo - halo, 0), np.minimum(hi + halo, dims))
         self._lo, self._hi, self._dims, self._frame, self._light = lo, hi, dims, frame, light
         self.centre = (lo + hi) / 2 * frame.step - frame.half
         self.scale = PART_RADIUS / float(np.linalg.norm((hi - lo) / 2 * frame.step))
-        self._empty = empty_distance(brick_ranges(self.box.values), self.box.optics)
+        self._empty = self.box.empty()
 
     @property
     def views(self) -> VolumePart:

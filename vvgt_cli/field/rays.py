@@ -136,9 +136,7 @@ def _piece_rays(
     rays: RayFile, box: VoxelBox, lo: np.ndarray, hi: np.ndarray, dims: tuple[int, int, int], light: Light | None
 ) -> Iterator[tuple[int, np.ndarray]]:
     """Yield, for the piece from voxel ``lo`` to ``hi`` (3,), bundle numbers and the rays that see anything."""
-    from vvgt_cli.dvr.bricks import brick_ranges, empty_distance
-
-    empty = empty_distance(brick_ranges(box.values), box.optics)
+    empty = box.empty()
     if empty.all():
         return
     cast = caster(box, empty, lo, hi, dims, light)
@@ -162,7 +160,7 @@ def caster(
 
     Args:
         box: these voxels and those around them.
-        empty: `empty_distance` of the box.
+        empty: `empty_bricks` of the box.
         lo: first voxel.
         hi: end of the range.
         dims: voxels of the volume, (x, y, z).
@@ -179,12 +177,12 @@ def caster(
         np.where(lo == 0, -np.inf, lo - 0.5), np.where(hi == dims, np.inf, hi - 0.5), np.array(dims, np.float64)
     ])  # fmt: skip
     begin = box.begin.astype(np.float64)
-    if box.texels is None:
+    if box.mixture is None:
         kernel = march.cast_segments if light is None else march.cast_lit_segments
     else:
         kernel = march.cast_grid_segments if light is None else march.cast_lit_grid_segments
     lit = None if light is None else light._replace(origin=begin)
-    bound = partial(kernel, box.voxels, box.optics, box.texels, empty, lit, faces, begin)
+    bound = partial(kernel, box.voxels, box.optics, box.mixture, empty, lit, faces, begin)
 
     def cast(bundle: Bundle, which: np.ndarray) -> np.ndarray:
         seen = np.zeros((len(which), len(bundle.offsets), 4), np.float32)

@@ -9,8 +9,8 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from vvgt_cli.dvr.layers import Layer, grid_box
-from vvgt_cli.dvr.layout import Texels, Voxels
+from vvgt_cli.dvr.layers import Layer, grid_box, mixture_box, scalar_tables
+from vvgt_cli.dvr.layout import Mixture, Texels, Voxels
 from vvgt_cli.dvr.scene import KernelRule, read_only
 from vvgt_cli.field.layered import OpenedFile, content_of, open_content
 from vvgt_cli.look.tables import Optics
@@ -60,12 +60,14 @@ class VoxelBox:
         grid: (z, y, x, 4) float32 texels of an optics grid, else None.
         optics: tables over ``values``.
         begin: (3,) first voxel in the volume, (x, y, z).
+        mixture: an optics grid as rays meet it, else None.
     """
 
     values: np.ndarray
     grid: np.ndarray | None
     optics: Optics
     begin: np.ndarray
+    mixture: Mixture | None = None
 
     @property
     def voxels(self) -> Voxels:
@@ -83,7 +85,14 @@ class VoxelBox:
         b = np.minimum(hi - self.begin, self.values.shape[::-1])
         index = tuple(slice(int(p), int(q)) for p, q in zip(a[::-1], b[::-1], strict=True))
         grid = None if self.grid is None else np.ascontiguousarray(self.grid[index])
-        return VoxelBox(read_only(self.values[index], self.values.dtype), grid, self.optics, self.begin + a)
+        mixture = None if self.mixture is None else self.mixture.part(index)
+        return VoxelBox(read_only(self.values[index], self.values.dtype), grid, self.optics, self.begin + a, mixture)
+
+    def empty(self) -> np.ndarray:
+        """Return `empty_bricks` of the box."""
+        from vvgt_cli.dvr.bricks import empty_bricks
+
+        return empty_bricks(self.values, self.optics, self.mixture)
 
 
 @dataclass(frozen=True)
@@ -130,7 +139,7 @@ class Layers:
     dims: tuple[int, int, int]
     scale: float
     optics: Optics = field(repr=False)
-    voxel_bytes = 60
+    voxel_bytes = 80
 
     def __getstate__(self) -> dict[str, object]:
         """Return the fields alone: other processes open the volumes themselves."""
@@ -145,13 +154,20 @@ class Layers:
             layers.append(replace(layer, volume=volume, colors=triple(colors) if colors else None))
         return layers
 
+    @cached_property
+    def _tables(self) -> list[Optics]:
+        step = hollow(self.grid, self.dims).unit_frame().step
+        return scalar_tables(self.layers, 1 / self.scale, float(np.mean(step)))
+
     def box(self, lo: np.ndarray, hi: np.ndarray) -> VoxelBox:
         """Implement `Scalars.box`."""
-        texels = grid_box(self._opened, hollow(self.grid, self.dims), lo, hi)
-        texels *= np.float32(1 / self.scale)
+        target, per_unit = hollow(self.grid, self.dims), 1 / self.scale
+        texels = grid_box(self._opened, target, lo, hi)
+        texels *= np.float32(per_unit)
         values = np.ascontiguousarray(texels[..., 3])
         values.flags.writeable = False
-        return VoxelBox(values, texels, self.optics, lo.astype(np.int64))
+        mixture = mixture_box(self._opened, self._tables, target, lo, hi, texels, per_unit)
+        return VoxelBox(values, texels, self.optics, lo.astype(np.int64), mixture)
 
     def visible(self) -> float:
         """Return the approximate number of visible voxels, from samples."""

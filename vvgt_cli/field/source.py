@@ -180,6 +180,11 @@ class StyledVolume:
         return self.name if len(self.layers) > 1 else self.tf.name
 
     @property
+    def mixed(self) -> bool:
+        """Whether rays classify layers of scalars before they add them up."""
+        return self.gridded and any(layer.interpolated for layer in self.layers)
+
+    @property
     def labels_alone(self) -> bool:
         """Whether every layer is a label map."""
         return all(isinstance(layer.tf, LabelTable) for layer in self.layers)
@@ -292,7 +297,8 @@ class StyledVolume:
 
         if self.gridded:
             grid = grid_of(self.layers, self.volume)
-            return Scene.of_grid(self.volume, self, self.unit_distance, grid, self.lighting, self.labels_alone)
+            about = self.volume, self, self.unit_distance
+            return Scene.of_grid(*about, grid, self.lighting, self.labels_alone, self.layers)
         assert isinstance(self.tf, TransferFunction)
         limits = (self.statistics.lo, self.statistics.hi)
         return Scene.build(self.volume, self.tf, self.unit_distance, limits, lighting=self.lighting, layout=self.layout)
