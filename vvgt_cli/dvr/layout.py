@@ -94,13 +94,14 @@ class Mixture(NamedTuple):
             `Texels` holds it; one texel of zeros where there are none.
         scalars: (K, nz, ny, nx) float32 coordinates in the tables, not clamped, of layers of scalars; NaN: unknown.
         nodes, cumulative: (K, n + 1, 4) float64 tables, as of `Optics`.
-        even: (K, n + 1) float64, the same.
+        dark, even: (K, n + 1) float64, the same.
     """
 
     grid: np.ndarray
     scalars: np.ndarray
     nodes: np.ndarray
     cumulative: np.ndarray
+    dark: np.ndarray
     even: np.ndarray
 
     @classmethod
@@ -109,7 +110,7 @@ class Mixture(NamedTuple):
         grid, shape = Texels(texels).values, (0, *texels.shape[:3])
         if scalars is None or not tables:
             none = np.zeros((0, 2, 4))
-            return cls(grid, np.zeros(shape, np.float32), none, none, none[..., 0])
+            return cls(grid, np.zeros(shape, np.float32), none, none, none[..., 0], none[..., 0])
         if scalars.dtype != np.float32 or scalars.ndim != 4 or not scalars.flags.c_contiguous:
             raise ValueError(f"scalars {scalars.shape} of {scalars.dtype}; expected contiguous float32 (K, nz, ny, nx)")
         return cls(grid, scalars, *(np.stack([getattr(one, name) for one in tables]) for name in cls._fields[2:]))
@@ -121,9 +122,9 @@ class Mixture(NamedTuple):
 
     def fields(self) -> Iterator[tuple[np.ndarray, Optics]]:
         """Yield the scalars (nz, ny, nx) of each layer, read-only, and their tables."""
-        for values, nodes, cumulative, even in zip(self.scalars, self.nodes, self.cumulative, self.even, strict=True):
+        for values, nodes, cumulative, dark, even in zip(self.scalars, *self[2:], strict=True):
             values.flags.writeable = False
-            yield values, Optics(0.0, 1.0, nodes, cumulative, even, even, even)
+            yield values, Optics(0.0, 1.0, nodes, cumulative, dark, even, even)
 
 
 class Light(NamedTuple):
@@ -158,5 +159,5 @@ class Light(NamedTuple):
 TUPLES: dict[type, str] = {Voxels: "V", Optics: "f8 f8 f8:2 f8:2 f8:1 f8:1 f8:1"}
 EXTINCTION: dict[type, str] = {**TUPLES, Voxels: "E"}
 LIT: dict[type, str] = {**TUPLES, Light: "f8 f8 f8 f8 i8 f8:2 f4:4 i8 f8 f8:1 f8:1"}
-GRID: dict[type, str] = {Texels: "f4:4", Mixture: "f4:4 f4:4 f8:3 f8:3 f8:2"}
+GRID: dict[type, str] = {Texels: "f4:4", Mixture: "f4:4 f4:4 f8:3 f8:3 f8:2 f8:2"}
 LIT_GRID: dict[type, str] = {**LIT, **EXTINCTION, **GRID}

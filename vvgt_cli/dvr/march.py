@@ -143,7 +143,7 @@ def _through_values(
 def _layer(mixture: Mixture, k: int) -> Optics:
     """Return the tables of layer ``k`` of scalars."""
     even = mixture.even[k]
-    return Optics(0.0, 1.0, mixture.nodes[k], mixture.cumulative[k], even, even, even)
+    return Optics(0.0, 1.0, mixture.nodes[k], mixture.cumulative[k], mixture.dark[k], even, even)
 
 
 @_jit
@@ -171,18 +171,22 @@ def _pass_layers(
     layer of scalars and, behind them, of the texels.
     """
     count, whole, place = mixture.scalars.shape[0], trans, 0.0
-    total, steep = scale(0.5, add(a, b)), False
+    total, shown, steep = scale(0.5, add(a, b)), lane(a, 3) + lane(b, 3) > 0.0, False
     for k in range(count):
-        total = add(total, _layer_mean(mixture, k, then[k], now[k]))
         low, high = min(then[k], now[k]), max(then[k], now[k])
-        if low >= 0.0 and high > mixture.even[k, U(int(low))]:
-            steep = True
-    parts = min(int(dt * lane(total, 3) / SUB_DEPTH) + 1, PARTS)
-    if steep and trans >= FAINT:
-        parts = max(parts, FINER)
+        if low >= 0.0 and high > mixture.dark[k, U(int(low))]:
+            total, shown = add(total, _layer_mean(mixture, k, then[k], now[k])), True
+            steep |= high > mixture.even[k, U(int(low))]
     if own is not None:
         for n in range(4 * count + 4):
             own[n] = 0.0
+    if not shown:
+        for k in range(count):
+            then[k] = now[k]
+        return seen, trans, t
+    parts = min(int(dt * lane(total, 3) / SUB_DEPTH) + 1, PARTS)
+    if steep and trans >= FAINT:
+        parts = max(parts, FINER)
     (px, py, pz), (dx, dy, dz), part = p, d, dt / parts
     for n in range(1, parts + 1):
         s, c = t + n * part, b

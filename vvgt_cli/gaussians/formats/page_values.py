@@ -126,9 +126,12 @@ def values_of(layers: Sequence[PageLayer | None], room: float | None = None, sha
 def _grids(layers: Sequence[PageLayer | None], most: int, limited: bool = False) -> Values | None:
     """Return the grids of layers, of at most so many cells together, as `values_of` does."""
     shown = [(number, layer) for number, layer in enumerate(layers) if layer is not None]
-    facts, contents, looks, offered = [], [], [], []
+    facts, contents, looks, offered, shares = [], [], [], [], {}
+    for n, (number, layer) in enumerate(sorted(shown, key=lambda one: one[1].volume.data.size)):
+        shares[number] = most // (len(shown) - n)  # what small ones leave, large ones have
+        most -= min(layer.volume.data.size, shares[number])
     for number, (volume, look, distance, statistics, lighting) in shown:
-        dims = coarser(volume, most // len(shown))
+        dims = coarser(volume, shares[number])
         values = None if isinstance(look, LabelTable) else averaged(volume, dims)
         if isinstance(look, LabelTable):
             own, codes, known = *_labels(look, volume, dims), OF_LABELS

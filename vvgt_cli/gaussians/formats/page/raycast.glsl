@@ -5,7 +5,7 @@ precision highp float;
 precision highp int;
 precision highp sampler3D;
 precision highp usampler3D;
-uniform vec3 origin[3], direction[3], voxel[3], jitter;  // at the lower left corner, and what they gain across and up; the edges of a voxel; of the pixel, and of the first sample
+uniform vec3 origin[3], direction[3], jitter;  // at the lower left corner, and what they gain across and up; of the pixel, and of the first sample
 uniform vec4 cuts[6], light, toward, face;  // dot(xyz, place) <= w of each stays; ambient (< 0: unlit), diffuse, specular, power; with w = 1 the light is at the eye; w > 0: the values from x on, as 1 / y greys, are shown on the cut
 uniform vec2 size, grey;  // of the picture; what is black of a MIP or X-ray, and 1 / window
 uniform float ds, again, most;  // between samples; frames before; by how much extinction may differ between two
@@ -33,8 +33,6 @@ float leaving(ivec3 block, vec3 q, vec3 r) {  // how far to the end of a block
   vec3 e = (vec3(block) + step(vec3(0.0), r) - q) / mix(r, vec3(1e-9), lessThan(abs(r), vec3(1e-9)));
   return max(min(e.x, min(e.y, e.z)), 0.0) + 1e-5;
 }
-LAYERS
-
 vec3 lit(vec3 c, vec3 n, vec3 d) {
   if (light.x < 0.0) return c;
   float length_ = length(n);
@@ -45,19 +43,21 @@ vec3 lit(vec3 c, vec3 n, vec3 d) {
   return min(c * (light.x + light.y * abs(dot(n, l))) + light.z * white, vec3(1.0));
 }
 
+LAYERS
+
 // red, green, blue and opacity of a segment, and how far along the ray, on average, it absorbs
-vec4 passed(SAMPLE a, SAMPLE b, vec3 o, vec3 d, float from, float to, out float place) {
+vec4 passed(Sample a, Sample b, vec3 o, vec3 d, float from, float to, out float place) {
   vec4 one = optics(a, b);
   float depth = one.a * (to - from), part = (to - from) / float(PARTS), rest = 1.0;
   place = 0.5 * (from + to);
   if (depth <= 0.0) return vec4(0.0);
   bool fine = depth > THIN && steep(a, b);
   if (!fine && depth <= 1.0) return vec4(one.rgb / one.a, 1.0) * (1.0 - exp(-depth));
-  SAMPLE first = a;
+  Sample first = a;
   vec4 own = vec4(0.0);
   float sum = 0.0;
   for (int n = 1; n <= PARTS; n++) {
-    SAMPLE next = mix(first, b, float(n) / float(PARTS));
+    Sample next = blended(first, b, float(n) / float(PARTS));
     if (fine && n < PARTS) next = sampled(o + d * (from + float(n) * part));
     one = optics(a, next);
     float alpha = rest * (1.0 - exp(-one.a * part));
@@ -75,7 +75,7 @@ vec4 passed(SAMPLE a, SAMPLE b, vec3 o, vec3 d, float from, float to, out float 
 vec4 along(vec3 o, vec3 d, float t0, float t1, vec3 cut) {
   float start = fract(52.9829189 * fract(dot(gl_FragCoord.xy, vec2(0.06711056, 0.00583715))) + jitter.z), last = t0, t = t0 + ds * start, A = 0.0, best = -1.0, end = t0;
   vec3 C = vec3(0.0);
-  SAMPLE then = sampled(o + d * t0);
+  Sample then = sampled(o + d * t0);
   if (face.w > 0.0 && dot(cut, cut) > 0.0) {
     vec4 seen = onFace(o + d * t0);
     if (max(seen.r, max(seen.g, seen.b)) >= 0.002) return vec4(seen.rgb, 1.0);
@@ -93,7 +93,7 @@ vec4 along(vec3 o, vec3 d, float t0, float t1, vec3 cut) {
       end = last + block.x;
     }
     t = min(t, t1);
-    SAMPLE now = sampled(o + d * t);
+    Sample now = sampled(o + d * t);
     if (kind == 1) {
       if (alone == 0 || kept(o + d * t) > 0.5) best = max(best, greater(then, now));
     }
@@ -103,7 +103,7 @@ vec4 along(vec3 o, vec3 d, float t0, float t1, vec3 cut) {
       if (alone > 0 && own.a > 0.0) own *= kept(o + d * place);
       if (own.a > 0.0) {
         vec3 c = own.rgb / own.a;
-        if (kind == 0 && light.x >= 0.0) c = lit(c, dot(cut, cut) > 0.0 && last - t0 < ds ? cut : normal(o + d * place), d);
+        if (kind == 0 && light.x >= 0.0) c = dot(cut, cut) > 0.0 && last - t0 < ds ? lit(c, cut, d) : lighted(c, then, now, o + d * place, d);
         C += (1.0 - A) * own.a * c;
         A += (1.0 - A) * own.a;
       }

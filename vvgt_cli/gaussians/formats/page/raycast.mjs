@@ -40,10 +40,9 @@ const less = (a, b) => (a < b ? a : b), more = (a, b) => (a > b ? a : b);
 
 // what the shader has for each layer
 function layersText(layers) {
-  const each = (text) => layers.map((layer, k) => text(k, layer)).join('\n'), single = layers.length === 1 && !layers[0].labels;
-  const sum = (name, ...rest) => layers.map((_, k) => `${name}${k}(p${rest.map((one) => `, ${one}`).join('')})`).join(' + ');
-  return `${single ? '#define SAMPLE float' : '#define SAMPLE vec4'}
-${each((k, { labels }) => `uniform ${labels ? 'usampler3D' : 'sampler3D'} v${k};
+  const joined = (mark, text) => layers.map((layer, k) => text(k, layer)).join(mark), each = (text) => joined('\n', text), single = layers.length === 1 && !layers[0].labels;
+  return `struct Sample { ${joined(' ', (k, { labels }) => `${labels ? 'vec4' : 'float'} s${k};`)} };  // values, and optics of labels
+${each((k, { labels, one }) => `uniform ${labels ? 'usampler3D' : 'sampler3D'} v${k};
 uniform sampler3D b${k};
 uniform mat4 m${k};
 uniform vec3 n${k}, f${k};  // dims; value at 0, what it gains, first row of the table
@@ -88,10 +87,16 @@ vec3 smooth${k}(vec3 p) {
     if (texelFetch(v${k}, clamp(i, ivec3(0), last), 0).r == own) { count += w; has += w * d; }
   }
   return count < all ? ((has - away * (count / all)) * n${k}) * mat3(m${k}) : vec3(0.0);
-}` : `float value${k}(vec3 p) { return f${k}.x + f${k}.y * texture(v${k}, (m${k} * vec4(p, 1.0)).xyz).r; }
-vec4 at${k}(vec3 p) {
-  float s = value${k}(p);
-  return s < -0.5${k ? ` || !within((m${k} * vec4(p, 1.0)).xyz)` : ''} ? vec4(0.0) : between(s, s, int(f${k}.z));
+}` : `float value${k}(vec3 p) {
+  vec3 q = (m${k} * vec4(p, 1.0)).xyz;
+  return ${k ? '!within(q) ? -1.0 : ' : ''}f${k}.x + f${k}.y * texture(v${k}, q).r;
+}
+vec3 gradient${k}(vec3 p) {
+  vec3 e = 1.0 / n${k}, q = clamp((m${k} * vec4(p, 1.0)).xyz, 0.5 * e, 1.0 - 0.5 * e);
+  float a[6] = float[6](texture(v${k}, q + vec3(e.x, 0, 0)).r, texture(v${k}, q + vec3(0, e.y, 0)).r, texture(v${k}, q + vec3(0, 0, e.z)).r, texture(v${k}, q - vec3(e.x, 0, 0)).r, texture(v${k}, q - vec3(0, e.y, 0)).r, texture(v${k}, q - vec3(0, 0, e.z)).r);
+  for (int i = 0; i < 6; i++) if (f${k}.x + f${k}.y * a[i] < -0.5) return vec3(0.0);
+  vec3 rise = vec3(a[0] - a[3], a[1] - a[4], a[2] - a[5]);
+  return all(lessThan(abs(rise), vec3(${FLAT * one}))) ? vec3(0.0) : (rise * n${k} * f${k}.y) * mat3(m${k});
 }`}`)}
 vec2 empty(vec3 p, vec3 d, float best) {
   vec2 span = vec2(1e9, 0.0), one;
@@ -100,30 +105,29 @@ ${each((k) => `  one = empty${k}(p, d, best);
   return span;
 }
 float kept(vec3 p) { return texture(piece, (m0 * vec4(p, 1.0)).xyz).r; }
-SAMPLE sampled(vec3 p) { return ${single ? 'value0(p)' : sum('at')}; }
-bool steep(SAMPLE a, SAMPLE b) { ${single ? 'vec4 off = abs(entry(clamp(b, 0.0, 1.0) * LAST, int(f0.z)) - entry(clamp(a, 0.0, 1.0) * LAST, int(f0.z))); return max(max(off.r, off.g), max(off.b, off.a)) > most' : 'return false'}; }
-vec4 optics(SAMPLE a, SAMPLE b) { return ${single ? 'min(a, b) < -0.5 ? vec4(0.0) : between(a, b, int(f0.z))' : '0.5 * (a + b)'}; }
-float greater(SAMPLE a, SAMPLE b) { return ${single ? 'max(a, b)' : '0.0'}; }
-vec3 normal(vec3 p) {
-  ${single ? `vec3 e = 1.0 / n0, q = clamp((m0 * vec4(p, 1.0)).xyz, 0.5 * e, 1.0 - 0.5 * e);
-  float a[6] = float[6](texture(v0, q + vec3(e.x, 0, 0)).r, texture(v0, q + vec3(0, e.y, 0)).r, texture(v0, q + vec3(0, 0, e.z)).r, texture(v0, q - vec3(e.x, 0, 0)).r, texture(v0, q - vec3(0, e.y, 0)).r, texture(v0, q - vec3(0, 0, e.z)).r);
-  for (int i = 0; i < 6; i++) if (f0.x + f0.y * a[i] < -0.5) return vec3(0.0);
-  vec3 rise = vec3(a[0] - a[3], a[1] - a[4], a[2] - a[5]);
-  return all(lessThan(abs(rise), vec3(${FLAT * layers[0].one}))) ? vec3(0.0) : (rise * n0 * f0.y) * mat3(m0);`
-    : `float most = 0.0, here;
-  int which = -1;
-${each((k, { labels }) => `  here = at${k}(p).a;
-  if (here > most) { most = here; which = ${labels ? k : -1}; }`)}
-${each((k, { labels }) => (labels ? `  if (which == ${k}) return smooth${k}(p);` : ''))}
-  vec3 n = vec3(0.0);
-  for (int i = 0; i < 3; i++) n += voxel[i] * (sampled(p + voxel[i]).a - sampled(p - voxel[i]).a) / dot(voxel[i], voxel[i]);
-  return n;`}
+Sample sampled(vec3 p) { return Sample(${joined(', ', (k, { labels }) => (labels ? `at${k}(p)` : `value${k}(p)`))}); }
+Sample blended(Sample a, Sample b, float f) { return Sample(${joined(', ', (k) => `mix(a.s${k}, b.s${k}, f)`)}); }
+bool steep(Sample a, Sample b) {
+  vec4 off = vec4(0.0);
+${each((k, { labels }) => (labels ? '' : `  if (min(a.s${k}, b.s${k}) > -0.5) off = max(off, abs(entry(clamp(b.s${k}, 0.0, 1.0) * LAST, int(f${k}.z)) - entry(clamp(a.s${k}, 0.0, 1.0) * LAST, int(f${k}.z))));`))}
+  return max(max(off.r, off.g), max(off.b, off.a)) > most;
+}
+${each((k, { labels }) => `vec4 optics${k}(Sample a, Sample b) { return ${labels ? `0.5 * (a.s${k} + b.s${k})` : `min(a.s${k}, b.s${k}) < -0.5 ? vec4(0.0) : between(a.s${k}, b.s${k}, int(f${k}.z))`}; }`)}
+vec4 optics(Sample a, Sample b) { return ${joined(' + ', (k) => `optics${k}(a, b)`)}; }
+float greater(Sample a, Sample b) { return ${single ? 'max(a.s0, b.s0)' : '0.0'}; }
+// colour c of a segment from a to b under the light: each layer has its own normals
+vec3 lighted(vec3 c, Sample a, Sample b, vec3 p, vec3 d) {
+  ${layers.length === 1 ? `return lit(c, ${layers[0].labels ? 'smooth' : 'gradient'}0(p), d);` : `vec3 plain = vec3(0.0), shaded = vec3(0.0);
+  vec4 one;
+${each((k, { labels }) => `  one = optics${k}(a, b);
+  if (one.a > 0.0) { plain += one.rgb; shaded += one.a * lit(one.rgb / one.a, ${labels ? 'smooth' : 'gradient'}${k}(p), d); }`)}
+  return min(c * shaded / max(plain, vec3(1e-9)), vec3(1.0));`}
 }
 vec4 onFace(vec3 p) {
   vec4 seen = vec4(0.0);
 ${each((k, { labels }) => (labels ? '' : `  if (faced == ${k}) {
     float s = value${k}(p);
-    if (s >= -0.5 && within((m${k} * vec4(p, 1.0)).xyz)) seen = vec4(vec3(clamp((s - face.x) * face.y, 0.0, 1.0)), 1.0);
+    if (s >= -0.5) seen = vec4(vec3(clamp((s - face.x) * face.y, 0.0, 1.0)), 1.0);
   }`))}
 ${each((k, { labels }) => (labels ? `  {
     vec3 q = (m${k} * vec4(p, 1.0)).xyz;
@@ -263,7 +267,6 @@ export function raycaster(facts, gridsOf, { app }) {
       ray('3f', `n${k}`, ...grid.dims);
       ray('3f', `f${k}`, ...scale, 2 * ROWS * k);
     }
-    ray('3fv', 'voxel', edgesOf(grids[0]).flat());
     look.step = Math.min(...grids.flatMap(edgesOf).map((edge) => Math.hypot(...edge)));
     look.layers.forEach((_, k) => tabulate(k));
   }
