@@ -21,7 +21,7 @@ from vvgt_cli.volume.stored import read_block
 SAME = 1e-3  # voxels up to which two grids are one
 SLAB = 16  # slices that are laid out at once
 MAX_FINER = 8  # times along an axis that a layer's voxels may refine the first volume's
-VOXEL_BYTES = 20  # of a scene: four float32, and extinction again
+VOXEL_BYTES = 24  # of a scene: four float32, and extinction again, of labels under light also smoothed
 
 
 @dataclass(frozen=True)

@@ -52,9 +52,9 @@ def optics_at(scene: Scene, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 def normals(scene: Scene, points: np.ndarray) -> np.ndarray:
     """Return directions (n, 3) of the gradient, box frame, at voxel coordinates (n, 3); zeros where there is none.
 
-    Central differences of stored voxels (clamped at the edges), interpolated trilinearly.
+    Central differences of stored voxels, or of `Scene.relief` (clamped at the edges), interpolated trilinearly.
     """
-    dims, values = scene.volume.dims, scene.values
+    dims, values = scene.volume.dims, scene.shaded.values
     gradient = np.zeros((len(points), 3))
     for at, weight in corners(points, dims):
         for axis in range(3):

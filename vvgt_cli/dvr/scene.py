@@ -10,6 +10,7 @@ import numpy as np
 
 from vvgt_cli.dvr.layout import Light, Texels, Voxels, pairs_fit
 from vvgt_cli.dvr.light import scene_light
+from vvgt_cli.dvr.relief import smoothed
 from vvgt_cli.look import Lighting, Named, TransferFunction
 from vvgt_cli.look.tables import Optics, build_tables
 from vvgt_cli.volume import Volume
@@ -57,6 +58,7 @@ class Scene:
         grid: (nz, ny, nx, 4) float32 extinction times (r, g, b, 1) per unit-frame length, of an optics grid: what is
             drawn. ``values`` and ``optics`` then hold its extinction alone: what light and bricks ask for.
         labels: the grid is one of labels alone.
+        relief: (nz, ny, nx) float32 extinction without its steps of voxels, of labels under light; else None.
         rays: draws in place of the CPU's kernels (`vvgt_cli.dvr.cuda`).
     """
 
@@ -72,6 +74,7 @@ class Scene:
     light: Light | None = None
     grid: np.ndarray | None = None
     labels: bool = False
+    relief: np.ndarray | None = None
     rays: Callable[..., None] | None = None
 
     @property
@@ -84,6 +87,11 @@ class Scene:
     def voxels(self) -> Voxels:
         """`values` as kernels take them."""
         return Voxels(self.values)
+
+    @property
+    def shaded(self) -> Voxels:
+        """What normals are taken from, as kernels take it: `relief`, or else `values`."""
+        return Voxels(self.values if self.relief is None else self.relief)
 
     @classmethod
     def build(
@@ -142,7 +150,7 @@ class Scene:
     def lit(self, lighting: Lighting) -> Scene:
         """Return the same scene under light; that of skies is traced here."""
         light = scene_light(lighting, self.volume.axes, self.step, self.values.shape, self.scattering)
-        return replace(self, lighting=lighting, light=light)
+        return replace(self, lighting=lighting, light=light, relief=smoothed(self.values) if self.labels else None)
 
     def scattering(self) -> Scattering:
         """Return the scene as paths are traced through it."""

@@ -42,7 +42,7 @@ from vvgt_cli.volume.stored import Stored, is_file_backed, planes
 if TYPE_CHECKING:
     from vvgt_cli.field.cells import Reader
 
-LAYOUT = 8  # version of the stored blocks: increase it whenever their content changes
+LAYOUT = 9  # version of the stored blocks: increase it whenever their content changes
 MIN_BLOCKED = 1 << 30  # bytes of values: more are processed in blocks, with a tenth of the memory (docs/log/blocks.md)
 LARGE = 0.25  # share of the free memory: smaller files are always read whole
 PROGRAM, CELL_BYTES = 3e8, 300  # bytes: interpreter, libraries and kernels; a base cell in memory
@@ -59,7 +59,7 @@ PACKED = (
     ".nd2",
     ".vtkhdf",
 )  # compressed: small files may hold many voxels
-RANGES, LAYER_VOXEL = 0.15, 20  # bytes per voxel: the map of empty space, an optics grid
+RANGES, LAYER_VOXEL = 0.15, 24  # bytes per voxel: the map of empty space, an optics grid (`dvr.layers.VOXEL_BYTES`)
 OWN = {"uint8": 0, "uint16": 0, "float32": 0, "int8": 1}  # bytes per voxel of the kernels' copy; other types 4
 LAYERED_BYTES = 60  # per voxel of an optics grid while a block is in memory
 
@@ -270,7 +270,8 @@ def _reader(source: StyledVolume, access: BlockAccess) -> tuple[Reader, float]:
     grid = replace(volume, data=np.zeros((1, 1, 1), np.uint8))
     places = tuple(tuple(map(access.place, (layer.volume, *(layer.colors or ())))) for layer in source.layers)
     layers = tuple(replace(layer, volume=grid, colors=None) for layer in source.layers)
-    reader = Layers(layers, places, grid, volume.dims, frame.scale, Optics.linear(top))
+    lit_labels = source.labels_alone and source.lighting is not None
+    reader = Layers(layers, places, grid, volume.dims, frame.scale, Optics.linear(top), lit_labels)
     return reader, reader.visible()
 
 

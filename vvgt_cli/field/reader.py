@@ -11,6 +11,7 @@ import numpy as np
 
 from vvgt_cli.dvr.layers import Layer, grid_box
 from vvgt_cli.dvr.layout import Texels, Voxels
+from vvgt_cli.dvr.relief import REACH, smoothed
 from vvgt_cli.dvr.scene import KernelRule, read_only
 from vvgt_cli.field.layered import OpenedFile, content_of, open_content
 from vvgt_cli.look.tables import Optics
@@ -60,17 +61,24 @@ class VoxelBox:
         grid: (z, y, x, 4) float32 texels of an optics grid, else None.
         optics: tables over ``values``.
         begin: (3,) first voxel in the volume, (x, y, z).
+        relief: as `Scene.relief`.
     """
 
     values: np.ndarray
     grid: np.ndarray | None
     optics: Optics
     begin: np.ndarray
+    relief: np.ndarray | None = None
 
     @property
     def voxels(self) -> Voxels:
         """`values` in the kernels' type."""
         return Voxels(self.values)
+
+    @property
+    def shaded(self) -> Voxels:
+        """What normals are taken from, as `Scene.shaded`."""
+        return Voxels(self.values if self.relief is None else self.relief)
 
     @property
     def texels(self) -> Texels | None:
@@ -83,7 +91,9 @@ class VoxelBox:
         b = np.minimum(hi - self.begin, self.values.shape[::-1])
         index = tuple(slice(int(p), int(q)) for p, q in zip(a[::-1], b[::-1], strict=True))
         grid = None if self.grid is None else np.ascontiguousarray(self.grid[index])
-        return VoxelBox(read_only(self.values[index], self.values.dtype), grid, self.optics, self.begin + a)
+        relief = None if self.relief is None else read_only(self.relief[index], np.dtype(np.float32))
+        values = read_only(self.values[index], self.values.dtype)
+        return VoxelBox(values, grid, self.optics, self.begin + a, relief)
 
 
 @dataclass(frozen=True)
@@ -122,6 +132,7 @@ class Layers:
         dims: voxels along (x, y, z).
         scale: unit-frame lengths per world length.
         optics: tables over extinction.
+        lit_labels: the layers are labels alone, under light: boxes have a `Scene.relief`.
     """
 
     layers: tuple[Layer, ...]
@@ -130,6 +141,7 @@ class Layers:
     dims: tuple[int, int, int]
     scale: float
     optics: Optics = field(repr=False)
+    lit_labels: bool = False
     voxel_bytes = 60
 
     def __getstate__(self) -> dict[str, object]:
@@ -147,11 +159,13 @@ class Layers:
 
     def box(self, lo: np.ndarray, hi: np.ndarray) -> VoxelBox:
         """Implement `Scalars.box`."""
-        texels = grid_box(self._opened, hollow(self.grid, self.dims), lo, hi)
+        reach = REACH if self.lit_labels else 0
+        first, end = np.maximum(lo - reach, 0), np.minimum(hi + reach, self.dims)
+        texels = grid_box(self._opened, hollow(self.grid, self.dims), first, end)
         texels *= np.float32(1 / self.scale)
-        values = np.ascontiguousarray(texels[..., 3])
-        values.flags.writeable = False
-        return VoxelBox(values, texels, self.optics, lo.astype(np.int64))
+        values = read_only(texels[..., 3], texels.dtype)
+        relief = smoothed(values) if self.lit_labels else None
+        return VoxelBox(values, texels, self.optics, first, relief).part(lo, hi)
 
     def visible(self) -> float:
         """Return the approximate number of visible voxels, from samples."""

@@ -62,20 +62,13 @@ ${k ? '  if (!within(q)) return vec4(0.0);' : ''}
   return mix(mix(mix(look${k}(i), look${k}(ivec3(j.x, i.yz)), f.x), mix(look${k}(ivec3(i.x, j.y, i.z)), look${k}(ivec3(j.xy, i.z)), f.x), f.y),
     mix(mix(look${k}(ivec3(i.xy, j.z)), look${k}(ivec3(j.x, i.y, j.z)), f.x), mix(look${k}(ivec3(i.x, j.yz)), look${k}(j), f.x), f.y), f.z);
 }
-// the gradient of the label that shows most: a line fitted to where it is, over voxels nearer than NEAR, for its surface to be smooth
+// the gradient of extinction: a line fitted to it, over voxels nearer than NEAR, for surfaces to be smooth as vvgt_cli/dvr/relief.py has them
 vec3 smooth${k}(vec3 p) {
   vec3 q = (m${k} * vec4(p, 1.0)).xyz * n${k} - 0.5, away = vec3(0.0), has = vec3(0.0);
   ivec3 first = ivec3(floor(q)), last = ivec3(n${k}) - 1;
-  uint own = 0u;
-  float best = 0.0, all = 0.0, count = 0.0;
-  for (int c = 0; c < 8; c++) {
-    ivec3 i = first + ivec3(c & 1, (c >> 1) & 1, c >> 2), j = clamp(i, ivec3(0), last);
-    vec3 w = 1.0 - abs(q - vec3(i));
-    float here = look${k}(j).a * w.x * w.y * w.z;
-    if (here > best) { best = here; own = texelFetch(v${k}, j, 0).r; }
-  }
+  float own = look${k}(clamp(first, ivec3(0), last)).a, all = 0.0, count = 0.0;
   bool inside = true;  // as most of a body is
-  for (int c = 0; c < 8 && inside; c++) inside = texelFetch(v${k}, clamp(first + ivec3(c & 1, (c >> 1) & 1, c >> 2) * 5 - 2, ivec3(0), last), 0).r == own;
+  for (int c = 0; c < 8 && inside; c++) inside = look${k}(clamp(first + ivec3(c & 1, (c >> 1) & 1, c >> 2) * 5 - 2, ivec3(0), last)).a == own;
   if (inside) return vec3(0.0);
   for (int z = -2; z < 4; z++) for (int y = -2; y < 4; y++) for (int x = -2; x < 4; x++) {
     ivec3 i = first + ivec3(x, y, z);
@@ -85,9 +78,11 @@ vec3 smooth${k}(vec3 p) {
     w *= w;
     all += w;
     away += w * d;
-    if (texelFetch(v${k}, clamp(i, ivec3(0), last), 0).r == own) { count += w; has += w * d; }
+    w *= look${k}(clamp(i, ivec3(0), last)).a - own;  // not of what is all around, which would leave its rounding
+    count += w;
+    has += w * d;
   }
-  return count < all ? ((has - away * (count / all)) * n${k}) * mat3(m${k}) : vec3(0.0);
+  return ((has - away * (count / all)) * n${k}) * mat3(m${k});
 }` : `float value${k}(vec3 p) { return f${k}.x + f${k}.y * texture(v${k}, (m${k} * vec4(p, 1.0)).xyz).r; }
 vec4 at${k}(vec3 p) {
   float s = value${k}(p);
