@@ -58,7 +58,7 @@ class Scene:
         grid: (nz, ny, nx, 4) float32 extinction times (r, g, b, 1) per unit-frame length, of an optics grid: what is
             drawn. ``values`` and ``optics`` then hold its extinction alone: what light and bricks ask for.
         labels: the grid is one of labels alone.
-        relief: (nz, ny, nx) float32 extinction without its steps of voxels, of labels under light; else None.
+        relief: (nz, ny, nx) float32, `smoothed` extinction of labels under light; else None.
         rays: draws in place of the CPU's kernels (`vvgt_cli.dvr.cuda`).
     """
 
