@@ -103,7 +103,7 @@ def test_normals_are_the_twins_at_edges_too(dtype, nx):
     voxels = rng.uniform(-0.5, np.array([nx, 4, 5]) - 0.5, (300, 3))
     voxels[::3] = np.round(voxels[::3])
     found, twin = np.empty((300, 4)), normals(scene, voxels)
-    point_normals(scene.voxels, scene.optics, scene.step, voxels, found)
+    point_normals(scene.voxels, scene.shaded, scene.optics, scene.step, voxels, found)
     assert 0.05 < (~twin.any(axis=1)).mean() < 0.9
     np.testing.assert_array_equal(found[:, :3].any(axis=1), twin.any(axis=1))
     np.testing.assert_allclose(found[:, :3], twin, atol=1e-6)

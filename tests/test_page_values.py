@@ -13,6 +13,7 @@ import pytest
 
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians.formats.page_values import PageLayer, Values, packed, values_of
+from vvgt_cli.look import read_transfer_function
 from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.labels import Label, LabelTable
 from vvgt_cli.volume import Volume, averaged
@@ -196,6 +197,13 @@ def test_labels_are_sampled_and_refer_to_their_list(monkeypatch):
     assert [one["name"] for one in facts["labels"]] == ["<b>", "c"]
     assert (facts["dims"], facts["bits"]) == ([4, 4, 4], 8)
     np.testing.assert_array_equal(unpacked(content, facts)[:, 0, 0], [-1, 0, 1, -1])
+
+
+def test_small_layers_leave_their_cells_to_large_ones(monkeypatch):
+    monkeypatch.setattr("vvgt_cli.gaussians.formats.page_values.MAX_CELLS", 600)
+    small, large = (Volume(np.random.default_rng(1).random((n, n, n)).astype(np.float32)) for n in (4, 8))
+    layers = [PageLayer(volume, read_transfer_function("gray:0,1"), 1.0) for volume in (large, small)]
+    assert [facts["dims"] for facts in values_of(layers).facts] == [[8, 8, 8], [4, 4, 4]]
 
 
 @pytest.fixture

@@ -34,17 +34,18 @@ CHUNK = 1 << 14  # Gaussians whose highlights are projected at once
 BRIGHTEST = 2.0  # as `vvgt_cli.closed_form.fit` has it
 
 
-@parallel_kernel("Voxels Optics f8:1 f8:2 f8:2", LIT, fastmath=FLAGS, error_model="numpy")
+@parallel_kernel("Voxels Voxels Optics f8:1 f8:2 f8:2", LIT, fastmath=FLAGS, error_model="numpy")
 def point_normals(
-    thread: ThreadSlice, voxels: Voxels, optics: Optics, edge: np.ndarray, points: np.ndarray, out: np.ndarray
-) -> None:
+    thread: ThreadSlice, voxels: Voxels, shaded: Voxels, optics: Optics, edge: np.ndarray, points: np.ndarray,
+    out: np.ndarray,
+) -> None:  # fmt: skip
     """Write normal (x, y, z) and extinction at voxel coordinates ``points`` (n, 3) into ``out`` (n, 4).
 
-    ``edge`` (3,) of `Light`; extinction per unit-frame length, the edge voxels' beyond the box.
+    ``shaded`` as of `Scene`; ``edge`` (3,) of `Light`; extinction per unit-frame length, the edge voxels' beyond.
     """
     for k in iterations(thread, len(points)):
         x, y, z = points[k, 0], points[k, 1], points[k, 2]
-        out[k, 0], out[k, 1], out[k, 2] = normal(voxels.values, edge, x, y, z)
+        out[k, 0], out[k, 1], out[k, 2] = normal(shaded.values, edge, x, y, z)
         u = table_coordinate(sample(voxels.values, x, y, z), optics)
         out[k, 3] = max(mean_optics(u, u, optics)[3], 0.0) if u >= 0.0 else 0.0
 
@@ -168,9 +169,8 @@ def centroids(moments: np.ndarray) -> np.ndarray:
 def at_points(scene: Scene, points: np.ndarray) -> np.ndarray:
     """Return normals and extinction (n, 4) of `point_normals` at points (n, 3) of the box frame."""
     out = np.empty((len(points), 4))
-    point_normals(
-        scene.voxels, scene.optics, scene.step, np.ascontiguousarray((points + scene.half) / scene.step - 0.5), out
-    )
+    at = np.ascontiguousarray((points + scene.half) / scene.step - 0.5)
+    point_normals(scene.voxels, scene.shaded, scene.optics, scene.step, at, out)
     return out
 
 

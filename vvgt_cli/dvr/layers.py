@@ -24,7 +24,7 @@ SLAB = 16  # slices that are laid out at once
 MAX_SCALARS = 7  # layers of scalars that rays classify, what `march` has room for; of more, voxels are
 FARTHEST = 1e30  # coordinate in a table: none is infinite
 MAX_FINER = 8  # times along an axis that a layer's voxels may refine the first volume's
-VOXEL_BYTES = 20  # of a scene: four float32, and extinction again; and four for each layer of scalars
+VOXEL_BYTES = 24  # of a scene: four float32, and extinction again, of labels under light also smoothed
 
 
 @dataclass(frozen=True)
@@ -188,8 +188,7 @@ def mixture_box(
     """
     if not tables:
         return Mixture.of(texels)
-    inner = _scalars(layers)
-    others = [layer for layer in layers if all(layer is not one for one in inner)]
+    inner, others = _scalars(layers), _others(layers)
     out = np.empty((len(inner), *texels.shape[:3]), np.float32)
     for layer, own, values in zip(inner, tables, out, strict=True):
         places = (_values_in(layer, target, lo, hi) - own.lo) * own.inv_width
@@ -201,6 +200,17 @@ def mixture_box(
 def _scalars(layers: Sequence[Layer]) -> list[Layer]:
     """Return the layers that rays interpolate before they classify them."""
     return [layer for layer in layers if layer.interpolated][:MAX_SCALARS]
+
+
+def _others(layers: Sequence[Layer]) -> list[Layer]:
+    """Return the layers that are classified at voxels."""
+    inner = _scalars(layers)
+    return [layer for layer in layers if all(layer is not one for one in inner)]
+
+
+def smooth_labels(layers: Sequence[Layer]) -> bool:
+    """Return whether what is classified at voxels is labels, whose normals are smoothed under light."""
+    return bool(_others(layers)) and all(isinstance(layer.tf, LabelTable) for layer in _others(layers))
 
 
 def scalar_tables(layers: Sequence[Layer], per_unit: float, voxel: float) -> list[Optics]:

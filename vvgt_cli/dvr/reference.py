@@ -60,9 +60,9 @@ def matter_at(scene: Scene, points: np.ndarray) -> Iterator[tuple[np.ndarray, np
     Extinction (n,) per unit-frame length, colour (n, 3), and the values (nz, ny, nx) that have its normals.
     """
     if scene.mixture is None or not len(scene.mixture.scalars):
-        yield *optics_at(scene, points), scene.values
+        yield *optics_at(scene, points), scene.relieved.values
         return
-    yield *_parted(grid_values(scene.mixture.grid, points)), scene.values
+    yield *_parted(grid_values(scene.mixture.grid, points)), scene.relieved.values
     inner = [layer for layer in cast(Any, scene.tf).layers if layer.interpolated]
     for layer, values in zip(inner, scene.mixture.scalars, strict=True):
         matrix = np.linalg.inv(layer.volume.affine) @ scene.volume.affine
@@ -76,10 +76,10 @@ def matter_at(scene: Scene, points: np.ndarray) -> Iterator[tuple[np.ndarray, np
 def normals(scene: Scene, points: np.ndarray, values: np.ndarray | None = None) -> np.ndarray:
     """Return directions (n, 3) of the gradient, box frame, at voxel coordinates (n, 3); zeros where there is none.
 
-    Central differences of ``values`` (nz, ny, nx), by default the scene's, at voxels (clamped at the edges),
+    Central differences of ``values`` (nz, ny, nx), by default `Scene.shaded`, at voxels (clamped at the edges),
     interpolated trilinearly.
     """
-    dims, values = scene.volume.dims, scene.values if values is None else values
+    dims, values = scene.volume.dims, scene.shaded.values if values is None else values
     gradient = np.zeros((len(points), 3))
     for at, weight in corners(points, dims):
         for axis in range(3):

@@ -141,7 +141,7 @@ def host_rays(scene: Scene) -> Callable[..., None]:
         kernel = march.render_tiles if scene.light is None else march.render_lit_tiles
         return partial(kernel, scene.voxels, scene.optics, None, scene.empty, scene.light)
     kernel = march.render_grid_tiles if scene.light is None else march.render_lit_grid_tiles
-    return partial(kernel, scene.voxels, scene.optics, scene.mixture, scene.empty, scene.light)
+    return partial(kernel, scene.relieved, scene.optics, scene.mixture, scene.empty, scene.light)
 
 
 class Viewed(Protocol):

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vvgt_cli.dvr.layers import Layer, mixture_box, scalar_tables
+from vvgt_cli.dvr.layers import Layer, mixture_box, scalar_tables, smooth_labels
 from vvgt_cli.dvr.layout import Light, Mixture, Texels, Voxels, pairs_fit
 from vvgt_cli.dvr.light import scene_light
+from vvgt_cli.dvr.relief import smoothed
 from vvgt_cli.look import Lighting, Named, TransferFunction
 from vvgt_cli.look.tables import Optics, build_tables
 from vvgt_cli.volume import Volume
@@ -60,6 +61,8 @@ class Scene:
             then hold its extinction alone.
         mixture: the same as rays meet it, which classify scalars between voxels.
         labels: the grid is one of labels alone.
+        smooth: labels, with or without layers of scalars, are all there is.
+        relief: (nz, ny, nx) float32, `smoothed` extinction of such labels under light; else None.
         rays: draws in place of the CPU's kernels (`vvgt_cli.dvr.cuda`).
     """
 
@@ -76,6 +79,8 @@ class Scene:
     grid: np.ndarray | None = None
     mixture: Mixture | None = None
     labels: bool = False
+    smooth: bool = False
+    relief: np.ndarray | None = None
     rays: Callable[..., None] | None = None
 
     @property
@@ -88,6 +93,16 @@ class Scene:
     def voxels(self) -> Voxels:
         """`values` as kernels take them."""
         return Voxels(self.values)
+
+    @property
+    def relieved(self) -> Voxels:
+        """What the normals of texels are taken from, as kernels take it: `relief`, or else `values`."""
+        return Voxels(self.values if self.relief is None else self.relief)
+
+    @property
+    def shaded(self) -> Voxels:
+        """What the normals of all matter are taken from: `relieved`, or `values` where there are scalars, too."""
+        return self.voxels if self.mixture is not None and len(self.mixture.scalars) else self.relieved
 
     @classmethod
     def build(
@@ -144,13 +159,16 @@ class Scene:
         optics, tables = Optics.linear(float(values.max())), scalar_tables(layers, per_unit, float(np.mean(frame.step)))
         mixture = mixture_box(layers, tables, volume, np.zeros(3, np.int64), np.array(volume.dims), grid, per_unit)
         empty = bricks.empty_bricks(values, optics, mixture)
-        scene = cls(volume, tf, unit_distance, values, optics, empty, half, step, None, None, grid, mixture, labels)
+        smooth = labels or smooth_labels(layers)
+        about = None, None, grid, mixture, labels, smooth
+        scene = cls(volume, tf, unit_distance, values, optics, empty, half, step, *about)
         return scene if lighting is None else scene.lit(lighting)
 
     def lit(self, lighting: Lighting) -> Scene:
         """Return the same scene under light; that of skies is traced here."""
         light = scene_light(lighting, self.volume.axes, self.step, self.values.shape, self.scattering)
-        return replace(self, lighting=lighting, light=light)
+        relief = smoothed(self.mixture.grid[..., 3]) if self.mixture is not None and self.smooth else None
+        return replace(self, lighting=lighting, light=light, relief=relief)
 
     def scattering(self) -> Scattering:
         """Return the scene as paths are traced through it."""

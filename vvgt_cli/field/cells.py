@@ -142,7 +142,7 @@ def normals_in(box: VoxelBox, points: np.ndarray, step: np.ndarray) -> np.ndarra
     from vvgt_cli.closed_form.lit import point_normals
 
     out = np.empty((len(points), 4))
-    point_normals(box.voxels, box.optics, step, np.ascontiguousarray(points - box.begin), out)
+    point_normals(box.voxels, box.shaded, box.optics, step, np.ascontiguousarray(points - box.begin), out)
     return out
 
 

@@ -59,7 +59,7 @@ PACKED = (
     ".nd2",
     ".vtkhdf",
 )  # compressed: small files may hold many voxels
-RANGES, LAYER_VOXEL = 0.15, 20  # bytes per voxel: the map of empty space, an optics grid without scalars
+RANGES, LAYER_VOXEL = 0.15, 24  # bytes per voxel: the map of empty space, an optics grid (`dvr.layers.VOXEL_BYTES`)
 OWN = {"uint8": 0, "uint16": 0, "float32": 0, "int8": 1}  # bytes per voxel of the kernels' copy; other types 4
 LAYERED_BYTES = 80  # per voxel of an optics grid while a block is in memory
 
@@ -249,6 +249,7 @@ def _absolute(path: str) -> str:
 def _reader(source: StyledVolume, access: BlockAccess) -> tuple[Reader, float]:
     """Return the reader of a source's boxes, and its approximate number of visible voxels."""
     from vvgt_cli.closed_form.samples import estimate, visible_share
+    from vvgt_cli.dvr.layers import smooth_labels
     from vvgt_cli.dvr.scene import kernel_rule
     from vvgt_cli.field.reader import Layers, Scalars
     from vvgt_cli.look.tables import Optics, build_tables
@@ -270,7 +271,8 @@ def _reader(source: StyledVolume, access: BlockAccess) -> tuple[Reader, float]:
     grid = replace(volume, data=np.zeros((1, 1, 1), np.uint8))
     places = tuple(tuple(map(access.place, (layer.volume, *(layer.colors or ())))) for layer in source.layers)
     layers = tuple(replace(layer, volume=grid, colors=None) for layer in source.layers)
-    reader = Layers(layers, places, grid, volume.dims, frame.scale, Optics.linear(top))
+    smooth = source.lighting is not None and smooth_labels(source.layers)
+    reader = Layers(layers, places, grid, volume.dims, frame.scale, Optics.linear(top), smooth)
     return reader, reader.visible()
 
 

@@ -182,7 +182,8 @@ def caster(
     else:
         kernel = march.cast_grid_segments if light is None else march.cast_lit_grid_segments
     lit = None if light is None else light._replace(origin=begin)
-    bound = partial(kernel, box.voxels, box.optics, box.mixture, empty, lit, faces, begin)
+    voxels = box.voxels if box.mixture is None else box.relieved
+    bound = partial(kernel, voxels, box.optics, box.mixture, empty, lit, faces, begin)
 
     def cast(bundle: Bundle, which: np.ndarray) -> np.ndarray:
         seen = np.zeros((len(which), len(bundle.offsets), 4), np.float32)

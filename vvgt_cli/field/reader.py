@@ -11,6 +11,7 @@ import numpy as np
 
 from vvgt_cli.dvr.layers import Layer, grid_box, mixture_box, scalar_tables
 from vvgt_cli.dvr.layout import Mixture, Texels, Voxels
+from vvgt_cli.dvr.relief import REACH, smoothed
 from vvgt_cli.dvr.scene import KernelRule, read_only
 from vvgt_cli.field.layered import OpenedFile, content_of, open_content
 from vvgt_cli.look.tables import Optics
@@ -61,6 +62,7 @@ class VoxelBox:
         optics: tables over ``values``.
         begin: (3,) first voxel in the volume, (x, y, z).
         mixture: an optics grid as rays meet it, else None.
+        relief: as `Scene.relief`.
     """
 
     values: np.ndarray
@@ -68,11 +70,22 @@ class VoxelBox:
     optics: Optics
     begin: np.ndarray
     mixture: Mixture | None = None
+    relief: np.ndarray | None = None
 
     @property
     def voxels(self) -> Voxels:
         """`values` in the kernels' type."""
         return Voxels(self.values)
+
+    @property
+    def relieved(self) -> Voxels:
+        """`Scene.relieved` of the box."""
+        return Voxels(self.values if self.relief is None else self.relief)
+
+    @property
+    def shaded(self) -> Voxels:
+        """`Scene.shaded` of the box."""
+        return self.voxels if self.mixture is not None and len(self.mixture.scalars) else self.relieved
 
     @property
     def texels(self) -> Texels | None:
@@ -86,7 +99,9 @@ class VoxelBox:
         index = tuple(slice(int(p), int(q)) for p, q in zip(a[::-1], b[::-1], strict=True))
         grid = None if self.grid is None else np.ascontiguousarray(self.grid[index])
         mixture = None if self.mixture is None else self.mixture.part(index)
-        return VoxelBox(read_only(self.values[index], self.values.dtype), grid, self.optics, self.begin + a, mixture)
+        relief = None if self.relief is None else read_only(self.relief[index], np.dtype(np.float32))
+        values = read_only(self.values[index], self.values.dtype)
+        return VoxelBox(values, grid, self.optics, self.begin + a, mixture, relief)
 
     def empty(self) -> np.ndarray:
         """Return `empty_bricks` of the box."""
@@ -131,6 +146,7 @@ class Layers:
         dims: voxels along (x, y, z).
         scale: unit-frame lengths per world length.
         optics: tables over extinction.
+        smooth: boxes have a `Scene.relief`.
     """
 
     layers: tuple[Layer, ...]
@@ -139,6 +155,7 @@ class Layers:
     dims: tuple[int, int, int]
     scale: float
     optics: Optics = field(repr=False)
+    smooth: bool = False
     voxel_bytes = 80
 
     def __getstate__(self) -> dict[str, object]:
@@ -161,13 +178,15 @@ class Layers:
 
     def box(self, lo: np.ndarray, hi: np.ndarray) -> VoxelBox:
         """Implement `Scalars.box`."""
+        reach = REACH if self.smooth else 0
+        first, end = np.maximum(lo - reach, 0), np.minimum(hi + reach, self.dims)
         target, per_unit = hollow(self.grid, self.dims), 1 / self.scale
-        texels = grid_box(self._opened, target, lo, hi)
+        texels = grid_box(self._opened, target, first, end)
         texels *= np.float32(per_unit)
-        values = np.ascontiguousarray(texels[..., 3])
-        values.flags.writeable = False
-        mixture = mixture_box(self._opened, self._tables, target, lo, hi, texels, per_unit)
-        return VoxelBox(values, texels, self.optics, lo.astype(np.int64), mixture)
+        values = read_only(texels[..., 3], texels.dtype)
+        mixture = mixture_box(self._opened, self._tables, target, first, end, texels, per_unit)
+        relief = smoothed(mixture.grid[..., 3]) if self.smooth else None
+        return VoxelBox(values, texels, self.optics, first, mixture, relief).part(lo, hi)
 
     def visible(self) -> float:
         """Return the approximate number of visible voxels, from samples."""

@@ -114,9 +114,10 @@ def for_budget(workload: Workload, gaussians: int) -> Workload:
 
 
 def _volume_bytes(scene: Scene) -> int:
-    """Return the bytes of the values, and of the copy if the kernels need another type."""
+    """Return the bytes of the values and grids, and of the copy if the kernels need another type."""
     data, values = scene.volume.data, scene.values
-    grid = 0 if scene.grid is None else scene.grid.nbytes
+    grids = scene.grid, scene.relief, scene.mixture and scene.mixture.scalars
+    grid = sum(one.nbytes for one in grids if one is not None)
     return data.nbytes + grid + (0 if np.may_share_memory(data, values) else values.nbytes)
 
 

@@ -13,7 +13,7 @@ uniform int kind, faced, alone;  // 0 the look, 1 MIP, 2 X-ray; the layer on the
 uniform sampler3D piece;
 uniform sampler2D looks, before;
 out vec4 color;
-const float LAST = float(TABLE - 1), MANY = 64.0, OPAQUE = 0.9995, THIN = 0.01, NEAR = 3.0;
+const float LAST = float(TABLE - 1), MANY = 64.0, OPAQUE = 0.9995, THIN = 0.01;
 const int ROWS = TABLE >> 8, PARTS = 8;
 
 vec4 entry(float i, int first) { return texelFetch(looks, ivec2(int(i) & 255, first + (int(i) >> 8)), 0); }
