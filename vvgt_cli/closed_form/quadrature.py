@@ -18,14 +18,14 @@ from vvgt_cli.dvr.vectors import row as row_of
 from vvgt_cli.jit.decorators import inlined, parallel_kernel
 from vvgt_cli.jit.threads import ThreadSlice, iterations
 
-_Between = tuple[int, int, float, float]  # of `_between`
+_Near = tuple[int, int, float, float]  # of `_between`
 Rows = tuple[np.ndarray, np.ndarray, np.ndarray]  # of `_rows`
 
 _jit = inlined(fastmath=FLAGS, error_model="numpy")
 
 
 @_jit
-def _between(p: float, d: float, n: int) -> _Between:
+def _between(p: float, d: float, n: int) -> _Near:
     """Return voxels on both sides of ``p`` along an axis of ``n``, the second's share, and the length of spread there.
 
     That is ``d``, and 0 in the rim before the first centre (beyond the last one both neighbours are the same voxel).
@@ -38,7 +38,7 @@ def _between(p: float, d: float, n: int) -> _Between:
 
 @_jit
 def _rows(
-    values: np.ndarray, y: _Between, z: _Between, first: int, value: np.ndarray, along_y: np.ndarray, along_z: np.ndarray
+    values: np.ndarray, y: _Near, z: _Near, first: int, value: np.ndarray, along_y: np.ndarray, along_z: np.ndarray
 ) -> tuple[float, float, float]:
     """Write voxels from ``first`` on, between rows: ``value``, and its differences over a point's box along y and z.
 
@@ -159,7 +159,7 @@ def shift_moments(row: np.ndarray, x: float, y: float, z: float, d: tuple[float,
 
 
 @_jit
-def _texel_row(values: np.ndarray, y: _Between, z: _Between, first: int, out: np.ndarray) -> bool:
+def _texel_row(values: np.ndarray, y: _Near, z: _Near, first: int, out: np.ndarray) -> bool:
     """Write voxels from ``first`` on, between rows, into ``out`` (n, 4); return whether any has extinction.
 
     ``y``, ``z`` of `_between`; the row holds the edge voxels where it leaves ``values`` (nz, ny, nx, 4).

@@ -89,9 +89,7 @@ class Checks:
         return self.state.gaussians() if self.record.kept else start
 
 
-def fingerprint(
-    gaussians: Gaussians, options: OptimizeOptions, *views: Any, others: Iterable[np.ndarray] = ()
-) -> str:
+def fingerprint(gaussians: Gaussians, options: OptimizeOptions, *views: Any, others: Iterable[np.ndarray] = ()) -> str:
     """Hash all that a run depends on; ``views``: `Train`, `Check` or None, ``others``: weights and which are free."""
     digest = hashlib.sha256(f"{STEPPED} {replace(options, checkpoint=None)!r}".encode())
     for array in (*gaussians.arrays().values(), *others):
