@@ -11,7 +11,7 @@ from tests.test_scale import FIT, bodies
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.blocks import spread_blocks
 from vvgt_cli.closed_form import VbmOptions
-from vvgt_cli.conversion.stages.parts import scored_views
+from vvgt_cli.conversion.stages.parts import cast_views
 from vvgt_cli.dvr import RenderSettings, render_view
 from vvgt_cli.dvr.render import FIT_VIEWS, BoxFrame, camera_arrays
 from vvgt_cli.field.block_store import BlockStore
@@ -194,7 +194,7 @@ def test_init_in_blocks_reports_its_error_against_the_volume(vvgt, tmp_path):
         assert f"{scores['psnr']:.2f}" == notes[-1][1]
     assert notes[0][1] == notes[1][1]
     scene, gaussians = load(SourceRequest(str(path))).scene(), read_ply(tmp_path / "32.ply")[0]
-    seen = scored_views(150)
+    seen = cast_views(150)
     theirs = score_views(
         [render_view(scene, *view) for view in seen],
         [render(gaussians, view.camera) for view in seen],

@@ -27,12 +27,12 @@ def views(g, cameras):
 TRUTH = cloud(seed=1)
 
 
-def run(path=None, stop=None, method="axes", start=None, steps=30, early=None):
+def run(path=None, stop=None, method="axes", start=None, steps=30, early=None, **others):
     options = OptimizeOptions.of(
         method, steps=steps, early=early, check_every=5, max_gaussians=50, checkpoint=path and str(path)
     )
     images, check = views(TRUTH, CAMERAS), (CHECKS, views(TRUTH, CHECKS))
-    return optimize(start or cloud(), CAMERAS, images, options, check, stop=stop)
+    return optimize(start or cloud(), CAMERAS, images, options, check, stop=stop, **others)
 
 
 def after(steps):
@@ -91,7 +91,11 @@ def test_another_runs_checkpoint_is_refused(tmp_path):
     path = tmp_path / "run.npz"
     run(path, after(2))
     before = path.read_bytes()
-    for other in ({"steps": 31}, {"start": cloud(seed=3)}, {"method": "adam"}):
+    weights = [np.full((32, 32), 0.5, np.float32)] * len(CAMERAS)
+    for other in (
+        {"steps": 31}, {"start": cloud(seed=3)}, {"method": "adam"}, {"weights": weights},
+        {"free": np.arange(40) < 20},
+    ):  # fmt: skip
         refused(UsageError, r"run\.npz", run, path, **other)
     assert path.read_bytes() == before
 

@@ -119,7 +119,7 @@ def test_a_checkpoint_holds_them(method, tmp_path):
     g, options = shiny(), OptimizeOptions.of(method, steps=9)
     images = views(shiny(seed=1), CAMERAS)
     path, states = str(tmp_path / "a.npz"), [begin(g, CAMERAS, options) for _ in range(2)]
-    walk = {"speed": 1.0, "elapsed": 0.0, "looked": 0}
+    walk = {"speed": 1.0, "elapsed": 0.0}
     for n in range(3):
         states[0].step(CAMERAS[n], images[n], 0.1, 1.0)
     judges = [Checks(state, None, OptimizeRecord()) for state in states]

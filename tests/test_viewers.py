@@ -249,7 +249,7 @@ def test_fog_differs_by_eight_bits_a_blend(viewer: str, fog: Shown, tmp_path: Pa
 
 
 def rounded(gaussians: Gaussians, viewer: str) -> Gaussians:
-    """Scales and opacities as the viewer keeps them (docs/viewers.md: Rounding)."""
+    """Scales and opacities as the viewer keeps them (docs/log/viewers.md: How viewers round)."""
     step = 21 / STEPS[viewer]
     opacity = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
     opacity = np.clip(np.round(255 * opacity) / 255, 1e-6, 1 - 1e-4)

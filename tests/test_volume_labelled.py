@@ -162,8 +162,8 @@ def test_netcdf_time_steps_are_chosen_by_component(tmp_path: Path) -> None:
     np.testing.assert_allclose(read_volume(str(path), ReadOptions(component=1)).data, -VALUES, rtol=1e-6)
     np.testing.assert_allclose(read_volume(str(path), ReadOptions(time=1)).data, -VALUES, rtol=1e-6)
     refused(UsageError, r"2 time steps; .*--time N", read_volume, str(path))
-    refused(UsageError, r"--time 2: .*expected 0 to 1", read_volume, str(path), ReadOptions(time=2))
-    refused(UsageError, "expected 0 to 1", read_volume, str(path), ReadOptions(component=2))
+    refused(UsageError, r"--time 2: expected a time step from 0 to 1", read_volume, str(path), ReadOptions(time=2))
+    refused(UsageError, "along time 2 .*not component 2; .* 0 to 1", read_volume, str(path), ReadOptions(component=2))
 
 
 @pytest.mark.parametrize("how", [{}, {"chunks": (2, 2, 2), "compression": "gzip", "shuffle": True}])
@@ -205,11 +205,31 @@ def test_hdf5_stays_in_its_folder(tmp_path: Path) -> None:
     layout = h5py.VirtualLayout((3, 4, 5), "f8")
     layout[:] = h5py.VirtualSource("../outside.h5", "field", (3, 4, 5))
     with h5py.File(path, "w") as file:
-        file["link"] = h5py.ExternalLink("../outside.h5", "/field")
+        file["link"], file["soft"] = h5py.ExternalLink("../outside.h5", "/field"), h5py.SoftLink("/link")
         file.create_virtual_dataset("virtual", layout)
         file.create_dataset("raw", (3, 4, 5), "f8", external=[("../outside.h5", 0, h5py.h5f.UNLIMITED)])
-    for name, message in (("link", "own folder"), ("virtual", "own folder"), ("raw", "other files")):
+    for name in ("link", "soft", "virtual", "raw"):
+        message = "other files" if name == "raw" else "own folder"
         refused(DataError, message, read_volume, f"{path}:/{name}")
+
+
+@pytest.mark.parametrize("place", ["x", "scaling_factor"])
+def test_facts_of_nexus_stay_in_the_folder(place: str, tmp_path: Path) -> None:
+    (tmp_path / "inner").mkdir()
+    for name in ("outside.h5", "inner/beside.h5"):
+        with h5py.File(tmp_path / name, "w") as file:
+            file["x"], file["scaling_factor"] = np.arange(5) * 0.5, 2.0
+    path = tmp_path / "inner" / "v.h5"
+    for there in ("beside.h5", "../outside.h5"):
+        with h5py.File(path, "w") as file:
+            group = file.create_group("entry/data")
+            group.attrs.update({"NX_class": "NXdata", "axes": ["z", "y", "x"]})
+            group["counts"], group["z"], group["y"] = VALUES, np.arange(3), np.arange(4)
+            group[place] = h5py.ExternalLink(there, place)
+        if there == "beside.h5":
+            volume = read_volume(str(path))
+            assert (volume.spacing[0], volume.slope) == ((0.5, 1) if place == "x" else (1, 2))
+    refused(DataError, "own folder", read_volume, str(path))
 
 
 @pytest.mark.parametrize("version", [2, 3])
@@ -254,9 +274,18 @@ def test_ome_zarr(tmp_path: Path) -> None:
     level = {"path": "0", "coordinateTransformations": moves}
     group.attrs["multiscales"] = [{"version": "0.4", "axes": axes, "datasets": [level, {"path": "1"}]}]
     check_grid(read_volume(str(store), ReadOptions(component=0)))
-    refused(UsageError, "choose along c with --component 0 to 1", read_volume, str(store))
+    refused(UsageError, "along c 2 channels of type float32; .* --channel 0 to 1, all", read_volume, str(store))
     assert read_volume(f"{store}:/1").dims == (3, 2, 3)
     refused(UsageError, "none of time; leave out --time 1", read_volume, str(store), ReadOptions(time=1))
+
+
+def test_a_magnitude_of_one_slice(tmp_path: Path) -> None:
+    group = zarr.open_group(str(tmp_path / "v.zarr"), mode="w", zarr_format=3)
+    group.create_array("v", data=np.stack([VALUES[0], 2 * VALUES[0]]), dimension_names=["c", "y", "x"])
+    group["v"].attrs["scale_factor"] = 0.5
+    group.attrs["ome"] = {"multiscales": [{"axes": [{"name": n} for n in "cyx"], "datasets": [{"path": "v"}]}]}
+    volume = read_volume(f"{tmp_path / 'v.zarr'}:/v", ReadOptions(component="magnitude"))
+    np.testing.assert_allclose(volume.data, 0.5 * np.sqrt(5) * np.abs(VALUES[:1]), rtol=1e-6)
 
 
 def test_ome_zarr_of_channels_over_time(tmp_path: Path) -> None:
@@ -272,7 +301,7 @@ def test_ome_zarr_of_channels_over_time(tmp_path: Path) -> None:
         volume = read_volume(str(store), ReadOptions(time=time, component=1))
         np.testing.assert_array_equal(volume.data, values[time, 1])
     refused(UsageError, "3 time steps", read_volume, str(store), ReadOptions(component=1))
-    refused(UsageError, "choose along c with --component", read_volume, str(store), ReadOptions(time=1))
+    refused(UsageError, "along c 2 channels of .* --channel 0 to 1", read_volume, str(store), ReadOptions(time=1))
 
 
 def test_zarr_refuses_codecs_that_run_code(tmp_path: Path) -> None:

@@ -103,7 +103,7 @@ def test_series(tmp_path: Path, suffix: str) -> None:
     for options, message in (
         ({"time": 2}, "expected a time step from 0 to 1"),
         ({"time": 0, "component": 1}, "leave out --component 1"),
-        ({"component": "T1"}, "not component T1"),
+        ({"component": "T1"}, "not component 'T1'"),
     ):
         refused(UsageError, message, read_volume, source, ReadOptions(**options))
     norm = read_volume(source, ReadOptions(component="magnitude"))

@@ -64,8 +64,8 @@ def test_a_choice_is_obeyed_or_an_error_that_lists(tmp_path: Path) -> None:
     still = write_ome(tmp_path / "b.ome.tif", VALUES[0, 0], "ZYX", {})
     for path, options, message in (
         (source, {}, r"2 channels \(0 'DAPI', 1 'GFP'\) of type uint16; expected one: try --channel 0 to 1"),
-        (source, {"component": 2, "time": 0}, r"2 channels .*, not 2; expected one"),
-        (source, {"component": "RFP", "time": 0}, r"'GFP'\) of type uint16, not 'RFP'"),
+        (source, {"component": 2, "time": 0}, r"2 channels .*, not channel 2; expected one"),
+        (source, {"component": "RFP", "time": 0}, r"'GFP'\) of type uint16, not channel 'RFP'"),
         (source, {"component": 1}, r"3 time steps; expected one: try --time N \(0 to 2\).*-o 'p_{:02d}.ply'"),
         (source, {"component": 1, "time": 3}, r"--time 3: expected a time step from 0 to 2"),
         (still, {"time": 1}, r"--time 1: it has 1 time step; leave out --time"),

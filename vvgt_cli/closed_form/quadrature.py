@@ -18,14 +18,14 @@ from vvgt_cli.dvr.vectors import row as row_of
 from vvgt_cli.jit.decorators import inlined, parallel_kernel
 from vvgt_cli.jit.threads import ThreadSlice, iterations
 
-Between = tuple[int, int, float, float]  # of `between`
+_Near = tuple[int, int, float, float]  # of `_between`
 Rows = tuple[np.ndarray, np.ndarray, np.ndarray]  # of `_rows`
 
 _jit = inlined(fastmath=FLAGS, error_model="numpy")
 
 
 @_jit
-def between(p: float, d: float, n: int) -> Between:
+def _between(p: float, d: float, n: int) -> _Near:
     """Return voxels on both sides of ``p`` along an axis of ``n``, the second's share, and the length of spread there.
 
     That is ``d``, and 0 in the rim before the first centre (beyond the last one both neighbours are the same voxel).
@@ -38,11 +38,11 @@ def between(p: float, d: float, n: int) -> Between:
 
 @_jit
 def _rows(
-    values: np.ndarray, y: Between, z: Between, first: int, value: np.ndarray, along_y: np.ndarray, along_z: np.ndarray
+    values: np.ndarray, y: _Near, z: _Near, first: int, value: np.ndarray, along_y: np.ndarray, along_z: np.ndarray
 ) -> tuple[float, float, float]:
     """Write voxels from ``first`` on, between rows: ``value``, and its differences over a point's box along y and z.
 
-    ``y``, ``z`` of `between`; the three rows (n,) float64 hold the edge voxels where they leave ``values``. Returns
+    ``y``, ``z`` of `_between`; the three rows (n,) float64 hold the edge voxels where they leave ``values``. Returns
     the smallest and largest value, and the largest square of both differences.
     """
     j0, j1, fy, dy = y
@@ -101,7 +101,7 @@ def _ranges(
 
 
 @_jit
-def deposit(row: np.ndarray, mass: float, first: float, second: float, y: float, z: float) -> None:
+def _deposit(row: np.ndarray, mass: float, first: float, second: float, y: float, z: float) -> None:
     """Add ``mass`` at (y, z), of moments ``first`` and ``second`` along x, to a cell's ``row`` (13,) of moments."""
     row[MASS] += mass
     row[X] += first
@@ -135,7 +135,7 @@ def _gather(
                 r, g, b = r + red, g + green, b + blue
         if mass > 0.0:
             row = out[m0 // points]
-            deposit(row, mass, first, second, y, z)
+            _deposit(row, mass, first, second, y, z)
             row[RED] += r
             row[GREEN] += g
             row[BLUE] += b
@@ -159,10 +159,10 @@ def shift_moments(row: np.ndarray, x: float, y: float, z: float, d: tuple[float,
 
 
 @_jit
-def _texel_row(values: np.ndarray, y: Between, z: Between, first: int, out: np.ndarray) -> bool:
+def _texel_row(values: np.ndarray, y: _Near, z: _Near, first: int, out: np.ndarray) -> bool:
     """Write voxels from ``first`` on, between rows, into ``out`` (n, 4); return whether any has extinction.
 
-    ``y``, ``z`` of `between`; the row holds the edge voxels where it leaves ``values`` (nz, ny, nx, 4).
+    ``y``, ``z`` of `_between`; the row holds the edge voxels where it leaves ``values`` (nz, ny, nx, 4).
     """
     j0, j1, fy, _ = y
     k0, k1, fz, _ = z
@@ -195,7 +195,7 @@ def _gather_texels(
         mass = lane(total, 3)
         if mass > 0.0:
             cell = out[m0 // points]
-            deposit(cell, mass, first, second, y, z)
+            _deposit(cell, mass, first, second, y, z)
             cell[RED] += lane(total, 0)
             cell[GREEN] += lane(total, 1)
             cell[BLUE] += lane(total, 2)
@@ -236,7 +236,7 @@ def _moments(
                 y = y0 + (py + 0.5) * dy - 0.5
                 if inside < 1 or z > nz - 0.5 or y > ny - 0.5:
                     continue
-                near_y, near_z, cy, cz = between(y, dy, ny), between(z, dz, nz), py // points[1], pz // points[2]
+                near_y, near_z, cy, cz = _between(y, dy, ny), _between(z, dz, nz), py // points[1], pz // points[2]
                 ly, lz = (py - cy * points[1] + 0.5) * box[1], (pz - cz * points[2] + 0.5) * box[2]
                 if texels is None:
                     low, high, steep = _rows(voxels.values, near_y, near_z, first, value, along_y, along_z)

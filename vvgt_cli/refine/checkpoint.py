@@ -10,6 +10,7 @@ import json
 import math
 import struct
 import zipfile
+from collections.abc import Iterable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -88,10 +89,10 @@ class Checks:
         return self.state.gaussians() if self.record.kept else start
 
 
-def fingerprint(gaussians: Gaussians, options: OptimizeOptions, *views: Any) -> str:
-    """Hash all that a run depends on; ``views``: `Train`, `Check` or None."""
+def fingerprint(gaussians: Gaussians, options: OptimizeOptions, *views: Any, others: Iterable[np.ndarray] = ()) -> str:
+    """Hash all that a run depends on; ``views``: `Train`, `Check` or None, ``others``: weights and which are free."""
     digest = hashlib.sha256(f"{STEPPED} {replace(options, checkpoint=None)!r}".encode())
-    for array in gaussians.arrays().values():
+    for array in (*gaussians.arrays().values(), *others):
         digest.update(array.tobytes())
     for part in filter(None, views):
         digest.update(repr(part[2:3]).encode())

@@ -36,7 +36,8 @@ def run(
     record = OptimizeRecord()
     state = begin(gaussians, cameras, options, free)
     checks = Checks(state, check, record, options.check_rule)
-    keep, course = _checkpoint(options, gaussians, (cameras, images), check, state, checks)
+    others = [*(weights or ()), *([] if free is None else [free])]
+    keep, course = _checkpoint(options, gaussians, (cameras, images), check, others, state, checks)
     entered, half = time.perf_counter(), 0 if options.early is None else options.early // 2
     order = spread_views(cameras, options.seed)
     if not record.checks:
@@ -93,13 +94,14 @@ class _Course:
 
 
 def _checkpoint(
-    options: OptimizeOptions, gaussians: Gaussians, train: Train, check: Check | None, state: State, checks: Checks
-) -> tuple[Callable[[], None], _Course]:
+    options: OptimizeOptions, gaussians: Gaussians, train: Train, check: Check | None, others: list[np.ndarray],
+    state: State, checks: Checks,
+) -> tuple[Callable[[], None], _Course]:  # fmt: skip
     """Return the run's checkpoint and its start: the end of the last one where there is a file, else the given one."""
     path = options.checkpoint
     if path is None:
         return lambda: None, _Course()
-    key = fingerprint(gaussians, options, train, check)
+    key = fingerprint(gaussians, options, train, check, others=others)
     course = _Course(**(resume(path, key, state, checks, checks.record) or {}))
     return lambda: save(path, key, state, checks, checks.record, asdict(course)), course
 

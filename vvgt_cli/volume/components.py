@@ -96,6 +96,42 @@ def choose_array(infos: Sequence[ArrayInfo], wanted: str | None, source: str) ->
     return order[choose(names, [str(infos[k]) for k in order], wanted, source, note=note)]
 
 
+def choose_component(
+    n: int, dtype: np.dtype, wanted: int | str | None, what: str, names: Sequence[str] = (),
+    colors: Sequence[tuple[float, float, float] | None] = (), color: bool = False, channels: bool = False,
+) -> int | None:  # fmt: skip
+    """Return the number of the component or channel asked for, or of the only one; None for the magnitude of all.
+
+    ``what`` has ``n`` of a type, for messages. They may have names and ``colors``, RGB in [0, 1]. ``color``: three or
+    four are red, green, blue and opacity; ``channels``: they are a microscope's, not samples or parts of vectors.
+
+    Raises:
+        SeveralComponents: several and none chosen.
+        UsageError: none such.
+    """
+    names = [*names] if len(names) == n and any(names) else []
+    if wanted == "magnitude" and n > 1:
+        return None
+    if isinstance(wanted, str) and names.count(wanted) == 1:
+        return names.index(wanted)
+    if wanted is None and n == 1:
+        return 0
+    if isinstance(wanted, int) and wanted < n:
+        return wanted
+    word = "channel" if channels else "component"
+    shown = listed([f"{k} {name[:40]!r}" for k, name in enumerate(names)], ", ")
+    text = f"{what} {n} {word}{'s' * (n > 1)}{f' ({shown})' if names else ''} of type {dtype.name}"
+    if n == 1:
+        raise UsageError(f"{text}; leave out --{word} {wanted}")
+    others = ", a name" * bool(names) + ", all" * channels
+    expected = f"expected one: try --{word} 0 to {n - 1}{others}, or --component magnitude"
+    if wanted is not None:
+        raise UsageError(f"{text}, not {word} {wanted!r}; {expected}")
+    raise SeveralComponents(
+        f"{text}; {expected}", n, color and n in (3, 4), colors if len(colors) == n else (), channels, names
+    )
+
+
 def select_component(
     values: np.ndarray,
     component: int | str | None,
@@ -121,19 +157,11 @@ def select_component(
     Raises:
         UsageError: several components and no choice (`SeveralComponents`), or a choice that does not exist.
     """
-    n = values.shape[3]
-    what = f"{source}: {label or 'its array'} has {n} component{'' if n == 1 else 's'} of type {values.dtype.name}"
-    if n == 1:
-        if component not in (None, 0):
-            raise UsageError(f"{what}; leave out --component {component}")
-        return contiguous(values[..., 0]), scaling
-    if component is None or (component != "magnitude" and component not in range(n)):
-        chosen = "" if component is None else f", not component {component}"
-        text = f"{what}{chosen}; expected a scalar: try --component 0 to {n - 1}, or --component magnitude"
-        raise SeveralComponents(text, n, color and n in (3, 4)) if component is None else UsageError(text)
-    if component == "magnitude":
+    what = f"{source}: {label or 'its array'} has"
+    number = choose_component(values.shape[3], values.dtype, component, what, color=color)
+    if number is None:
         return magnitude(np.moveaxis(values, -1, 0), *scaling), (1.0, 0.0)
-    return contiguous(values[..., int(component)]), scaling
+    return contiguous(values[..., number]), scaling
 
 
 def select_from_array(values: np.ndarray, info: ArrayInfo, component: int | str | None, source: str) -> np.ndarray:

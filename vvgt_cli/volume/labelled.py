@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, SeveralComponents, SeveralSteps, UsageError
+from vvgt_cli.errors import DataError, SeveralSteps, UsageError
 from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory
-from vvgt_cli.volume.components import contiguous, listed, select_component
+from vvgt_cli.volume.components import choose_component, contiguous, magnitude
 from vvgt_cli.volume.reading import ReadOptions, Segment, Volume, float_dtype, printable, segments_in, text_of, triple
 from vvgt_cli.volume.space import metres, unit_name
 from vvgt_cli.volume.stored import Stored
@@ -159,17 +159,16 @@ def labelled_volume(
     if dtype.kind not in "iufb":
         raise DataError(f"{source}: values of type {dtype}; expected integers or floats")
     _warn_of_unread(axes, attributes, options, source)
-    space, extra, step = _split_axes(list(axes), options := _numbered(axes, options), source)
-    zyx = _zyx(space, axes)
-    chosen = None if options.component == "magnitude" else options.component
+    space, extra, step = _split_axes(list(axes), options, source)
+    zyx, chosen = _zyx(space, axes), None
     index: list[Any] = [slice(None) if k in space else 0 for k in range(len(axes))]
-    for k, flag, value in ((extra, "--component", chosen), (step, "--time", options.time)):
-        if k is not None:
-            if value is not None and value not in range(axes[k].size):
-                named = f" ({listed([f'{n} {name!r}' for n, name in enumerate(axes[k].labels)], ', ')})"
-                expected = f"expected 0 to {axes[k].size - 1}{named if axes[k].labels else ''}"
-                raise UsageError(f"{source}: {flag} {value}: axis {axes[k]}; {expected}")
-            index[k] = slice(None) if value is None else value
+    if extra is not None:
+        it, what = axes[extra], f"{source}: axes {', '.join(map(str, axes))}, along"
+        what = f"{what} {printable(it.name) or 'the shortest of them'}"
+        chosen = choose_component(it.size, dtype, options.component, what, it.labels, it.colors, False, it.role == "c")
+        index[extra] = slice(None) if chosen is None else chosen
+    if step is not None:
+        index[step] = options.step(axes[step].size, source)
     if callable(stored) and options.stored and chunks is not None and len(space) == 3:
         return _left(stored, dtype, axes, index, zyx, attributes, options, source, name, chunks)
     if callable(stored):
@@ -182,8 +181,8 @@ def labelled_volume(
     kept = [k for k in range(len(axes)) if index[k] == slice(None)]
     order, spatial = [kept.index(k) for k in zyx], [axes[k] for k in zyx]
     if extra is not None and chosen is None:  # the magnitude over an axis of components
-        values = np.transpose(values, [*order, kept.index(extra)])
-        field, (slope, intercept) = select_component(values, "magnitude", source, scaling=(slope, intercept))
+        field = magnitude(np.transpose(values, [kept.index(extra), *order]), slope, intercept)
+        slope, intercept = 1.0, 0.0
     else:
         field = np.transpose(values, order)
     if field.ndim == 2:
@@ -197,14 +196,6 @@ def _warn_of_unread(axes: Sequence[Axis], attributes: Mapping[str, Any], options
     unread = [key for key in GEOMETRY if key in attributes]
     if unread and options.spacing is None and all(a.centres is None for a in axes):
         warnings.warn(f"{source}: attributes {', '.join(unread)} are not read; --spacing X Y Z sets it", stacklevel=4)
-
-
-def _numbered(axes: Sequence[Axis], options: ReadOptions) -> ReadOptions:
-    """Replace the name of a channel in the options by its number."""
-    for one in axes:
-        if isinstance(options.component, str) and one.labels.count(options.component) == 1:
-            return replace(options, component=one.labels.index(options.component))
-    return options
 
 
 def _split_axes(axes: list[Axis], options: ReadOptions, source: str) -> tuple[list[int], int | None, int | None]:
@@ -239,13 +230,6 @@ def _split_axes(axes: list[Axis], options: ReadOptions, source: str) -> tuple[li
         )
     if not odd and options.component not in (None, 0):
         raise UsageError(f"{source}: axes {listing}, none of components; leave out --component {options.component}")
-    if odd and options.component is None:
-        it = axes[odd[0]]
-        text = (
-            f"{source}: axes {listing}; expected three: choose along {it.name or 'the shortest of them'} "
-            f"with --component 0 to {it.size - 1} (or --component magnitude)"
-        )
-        raise SeveralComponents(text, it.size, False, it.colors, it.role == "c", it.labels)
     return space, odd[0] if odd else None, step
 
 

@@ -73,7 +73,7 @@ class OutOfCore(Stage):
         if self.together and self.steps:
             run.console.message(f"more than {MANY:,} Gaussians: refined part by part (docs/blocks.md)")
         if self.alone:
-            field.views.expect(scored_views(work.fit.screen))
+            field.views.expect(cast_views(work.fit.screen))
         make_blocks(work, field)
         if field.run_pass.shard is not None:
             return
@@ -158,7 +158,7 @@ class StoredViews(Stage):
         score_parts(work.run, work.parts)
 
 
-def scored_views(size: int) -> list[Picture]:
+def cast_views(size: int) -> list[Picture]:
     """List the blocks of three test views of ``size`` px."""
     from vvgt_cli.dvr import RenderSettings
 
@@ -181,7 +181,7 @@ def score_parts(run: Run, parts: FinishedParts) -> None:
         rays = RayFile(str(store.folder / f"{plan.rays}.npz"), plan.rays)
         x, y, z = plan.grid.blocks.dims
         seen = composed(rays, store, range(len(plan.grid.blocks)), (x, y, z))
-        gaussians, views = parts.gathered(), scored_views(plan.size)
+        gaussians, views = parts.gathered(), cast_views(plan.size)
 
         def picked(view: Picture) -> np.ndarray:
             drawn = render(gaussians, view.camera, plan.ply.rule or INRIA, blocks=view.blocks)

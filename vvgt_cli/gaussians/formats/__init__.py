@@ -153,19 +153,14 @@ def read_columns(path: str | Path) -> Splats:
     known = format_of(path) or _compressed(path)
     place, name = seekable(path), str(path)
     if known is not None:
-        return known.read(_content(place, path), name)
+        if place.stat().st_size > _LARGEST:
+            raise DataError(f"{path}: more than 4 GiB; expected a smaller file in this format, or a standard .ply")
+        return known.read(place.read_bytes(), name)
     check_memory(2 * place.stat().st_size, name, "check a part of its Gaussians")
     content = place.read_bytes()
     check_size(parse_header(content, name), len(content), name)
     with np.errstate(invalid="ignore"):
         return columns_of(content, name)
-
-
-def _content(place: Path, path: str | Path) -> bytes:
-    """Read the whole file at ``place``."""
-    if place.stat().st_size > _LARGEST:
-        raise DataError(f"{path}: more than 4 GiB; expected a smaller file in this format, or a standard .ply")
-    return place.read_bytes()
 
 
 def _compressed(path: str | Path) -> Format | None:

@@ -101,10 +101,10 @@ def spz_4(splats: Splats, name: str) -> bytes:
     return from_version_3(_version_3(splats, name), splats.comments, name)
 
 
-def zstandard(source: str) -> None:
-    """Check the libraries of `spz_4`; raise DataError if gsply or numcodecs is not installed."""
+def zstandard(source: str) -> Any:
+    """Return the module `numcodecs.zstd`; raise DataError if it or gsply is not installed."""
     gsply(source)
-    library(source)
+    return need("numcodecs.zstd", EXTRA, source, ".spz of version 4")
 
 
 def _version_3(splats: Splats, name: str) -> bytes:
@@ -172,11 +172,6 @@ _LEVEL = 12  # of Zstandard
 _COEFFICIENTS = {**HARMONICS, 4: 24}  # of version 4
 
 
-def library(source: str) -> Any:
-    """Return the module `numcodecs.zstd`; raise DataError if it is not installed."""
-    return need("numcodecs.zstd", "share", source, ".spz of version 4")
-
-
 def _lengths(count: int, degree: int) -> list[int]:
     """Return the sizes in bytes of centres, opacities, colours, scales, rotations and harmonics."""
     return [length * count for length in (9, 1, 3, 3, 4, 3 * _COEFFICIENTS[degree]) if length]
@@ -184,7 +179,7 @@ def _lengths(count: int, degree: int) -> list[int]:
 
 def from_version_3(content: bytes, comments: tuple[str, ...], name: str) -> bytes:
     """Convert the uncompressed content of version 3 to a file of version 4, which states the axes of a `.ply`."""
-    zstd = library(name)
+    zstd = zstandard(name)
     _, _, count, degree, fraction, flags = _OLD.unpack_from(content)
     records = _RECORD.pack(AXES, 4) + struct.pack("<I", RIGHT_DOWN_FRONT)
     text = "\n".join(comments).encode("ascii", "replace")
@@ -215,7 +210,7 @@ def to_version_3(content: bytes, name: str) -> tuple[bytes, list[str]]:
             "expected an .spz of version 4 with harmonics of degree 0 to 4"
         )
     check_memory(ROW_BYTES * count, f"{name}: {count:,} Gaussians", "a standard .ply, which is mapped, not loaded")
-    zstd, start, body = library(name), table + streams * _SIZES.size, []
+    zstd, start, body = zstandard(name), table + streams * _SIZES.size, []
     for number, length in enumerate(lengths):
         size, whole = _SIZES.unpack_from(content, table + number * _SIZES.size)
         part = content[start : start + size]

@@ -63,7 +63,7 @@ def page_contents(values: Values | None, options: PlyOptions) -> tuple[dict[str,
     if values is None:
         return {}, story
     look = {} if values.look is None else {"look": look_entry(values, options)}
-    return values.elements, values.scene | look | story
+    return values.elements, {"values": values.facts} | look | story
 
 
 def page_of_several(

@@ -84,11 +84,6 @@ class Values(NamedTuple):
         return sum(len(one.get("labels", ())) for one in self.facts)
 
     @property
-    def scene(self) -> dict[str, Any]:
-        """Entry of the page's scene."""
-        return {"values": self.facts}
-
-    @property
     def elements(self) -> dict[str, bytes]:
         """Contents by the ids of their elements."""
         return {one["element"]: content for one, content in zip(self.facts, self.contents, strict=True)}

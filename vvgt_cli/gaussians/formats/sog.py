@@ -85,7 +85,11 @@ def images_of(splats: Splats) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         "sh0": {"codebook": colors.tolist(), "files": ["sh0.webp"]},
     }
     if splats.f_rest.shape[1]:
-        rows, labels = _palette(splats.f_rest)
+        few = LARGEST_PALETTE  # as many as splat-transform makes
+        while few > max(count, 1024):
+            few //= 2
+        rows, labels = palette(splats.f_rest.reshape(count, -1), few)
+        rows = rows.reshape(len(rows), -1, 3)
         book = codebook(rows)
         lines = np.zeros((math.ceil(len(rows) / _ROW) * _ROW, rows.shape[1], 4), np.uint8)
         lines[: len(rows), :, :3], lines[: len(rows), :, 3] = places_in(book, rows), _BYTE
@@ -98,15 +102,6 @@ def images_of(splats: Splats) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
             "files": ["shN_centroids.webp", "shN_labels.webp"],
         }
     return images, meta
-
-
-def _palette(f_rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return palette rows (m, M, 3) for harmonics (K, M, 3), as many as splat-transform makes, and the row of each."""
-    count, few = len(f_rest), LARGEST_PALETTE
-    while few > max(count, 1024):
-        few //= 2
-    rows, labels = palette(f_rest.reshape(count, -1), few)
-    return rows.reshape(len(rows), -1, 3), labels
 
 
 def webp(image: np.ndarray) -> bytes:

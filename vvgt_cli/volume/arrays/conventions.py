@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -20,6 +20,7 @@ from vvgt_cli.volume.labelled import AXIS_ATTRIBUTES, CF_ATTRIBUTES, Axis, axis,
 from vvgt_cli.volume.reading import Volume, unit_rows
 
 _ITK = re.compile(r"/ITKImage/\d+")
+Held = Callable[[Any, str], Any]  # a group and a path in it to a dataset, None where there is none
 
 
 def coordinates_of(dataset: Any) -> tuple[np.ndarray, dict[str, Any]]:
@@ -29,7 +30,7 @@ def coordinates_of(dataset: Any) -> tuple[np.ndarray, dict[str, Any]]:
     return np.asarray(dataset[()]), stated
 
 
-def conventional_axes(file: Any, dataset: Any, source: str) -> tuple[list[Axis], dict[str, Any]] | None:
+def conventional_axes(file: Any, dataset: Any, source: str, held: Held) -> tuple[list[Axis], dict[str, Any]] | None:
     """Return a dataset's axes without dimension scales, slowest first, and CF attributes of its scaling.
 
     Return None where no convention is followed; raise DataError for a geometry that is stated and cannot be read.
@@ -40,15 +41,15 @@ def conventional_axes(file: Any, dataset: Any, source: str) -> tuple[list[Axis],
     axes: list[Axis] = []
     more: dict[str, Any] = {}
     if text_of(group.attrs.get("NX_class", "")) == "NXdata" and "axes" in group.attrs:
-        axes, more = _nexus(group, dataset), _nexus_scaling(group, dataset.name.rpartition("/")[2])
+        axes, more = _nexus(group, dataset, held), _nexus_scaling(group, dataset.name.rpartition("/")[2], held)
     elif "_SIMPL_GEOMETRY/SPACING" in group.parent and len(dataset.shape) >= 3:
-        axes = _dream3d(group.parent["_SIMPL_GEOMETRY"], dataset)
+        axes = _dream3d(group.parent, dataset, held)
     elif _ITK.fullmatch(group.name):
-        axes = _itk(group, dataset)
+        axes = _itk(group, dataset, held)
     elif view := re.fullmatch(r"/t\d+/(s\d+)/(\d+)/cells", dataset.name):
-        return _bigdataviewer(file[view[1]], int(view[2]), dataset)
+        return _bigdataviewer(file, view[1], int(view[2]), dataset, held)
     elif re.fullmatch("/Data/Image/[^/]+/Data", dataset.name) and len(dataset.shape) == 3:
-        axes = _velox(group, dataset)
+        axes = _velox(group, dataset, held)
     elif "axistags" in dataset.attrs:
         axes = _vigra(json.loads(text_of(dataset.attrs["axistags"])).get("axes", []), dataset)
     elif np.size(sizes) == 3 and len(dataset.shape) >= 3:
@@ -63,18 +64,18 @@ def _even(names: Sequence[str], sizes: Sequence[int], first: Any, steps: Any, un
     return [even_axis(*one, stated) for one in zip(names, sizes, first, steps, strict=False)]
 
 
-def _itk(group: Any, dataset: Any) -> list[Axis]:
+def _itk(group: Any, dataset: Any, held: Held) -> list[Axis]:
     """Return the axes of an image of ITK (HDF5ImageIO), whose facts are in the order x, y, z."""
-    steps, first = (np.ravel(group[key])[::-1] for key in ("Spacing", "Origin"))
+    steps, first = (np.ravel(held(group, key))[::-1] for key in ("Spacing", "Origin"))
     spatial = _even("tzyx"[-len(steps) :], dataset.shape, first, steps)
     return [*spatial, *(Axis("components", n, role="c") for n in dataset.shape[len(steps) :])]
 
 
-def turned_by_itk(group: Any, volume: Volume) -> Volume:
+def turned_by_itk(group: Any, volume: Volume, held: Held) -> Volume:
     """Return the volume in the anatomical space of ITK, if an image of it is in the group: an axis a row."""
     if not _ITK.fullmatch(group.name):
         return volume
-    axes, stated = np.eye(3), np.asarray(group["Directions"], np.float64)[:3, :3]
+    axes, stated = np.eye(3), np.asarray(held(group, "Directions"), np.float64)[:3, :3]
     axes[: len(stated), : len(stated)] = stated
     return replace(volume, direction=unit_rows(axes)[1], space="LPS")
 
@@ -104,7 +105,7 @@ def _openpmd(dataset: Any, source: str) -> tuple[list[Axis], dict[str, Any]]:
     return axes, {"scale_factor": dataset.attrs["unitSI"]} if "unitSI" in dataset.attrs else {}
 
 
-def _nexus(group: Any, dataset: Any) -> list[Axis]:
+def _nexus(group: Any, dataset: Any, held: Held) -> list[Axis]:
     """Return the axes of an NXdata group's signal, by the coordinates beside it; none where they do not fit."""
     names = [text_of(name) for name in np.asarray(group.attrs["axes"]).reshape(-1)]
     names = names[0].split(":") if len(names) == 1 and len(dataset.shape) > 1 else names
@@ -112,28 +113,28 @@ def _nexus(group: Any, dataset: Any) -> list[Axis]:
         return []
     axes = []
     for name, size in zip(names, dataset.shape, strict=True):
-        beside = group.get(name)
-        if beside is None or getattr(beside, "shape", None) != (size,) or beside.dtype.kind not in "iuf":
+        beside = None if name == "." else held(group, name)
+        if beside is None or beside.shape != (size,) or beside.dtype.kind not in "iuf":
             axes.append(axis("" if name == "." else name, size))
             continue
         axes.append(axis(name, size, *coordinates_of(beside)))
     return axes
 
 
-def _bigdataviewer(setup: Any, level: int, dataset: Any) -> tuple[list[Axis], dict[str, Any]]:
+def _bigdataviewer(file: Any, setup: str, level: int, dataset: Any, held: Held) -> tuple[list[Axis], dict[str, Any]]:
     """Return the axes of a view of BigDataViewer in voxels of the finest level, and the sign of its values.
 
     Without the setup's attribute ``dataType``, int16 stands for uint16 (bigdataviewer-core, ``Hdf5ImageLoader``).
     """
-    factors = setup["resolutions"][level][::-1]
+    factors = held(file, f"{setup}/resolutions")[level][::-1]
     axes = _even("zyx", dataset.shape, (factors - 1) / 2, factors)
-    unsigned = text_of(setup.attrs.get("dataType", "uint16")).startswith("uint")
+    unsigned = text_of(file[setup].attrs.get("dataType", "uint16")).startswith("uint")
     return axes, {"_Unsigned": "true"} if unsigned else {}
 
 
-def _velox(group: Any, dataset: Any) -> list[Axis]:
+def _velox(group: Any, dataset: Any, held: Held) -> list[Axis]:
     """Return the axes y, x and frames of an image of Velox; its metadata are JSON in bytes, a column a frame."""
-    stated = group["Metadata"][:, 0].tobytes().partition(b"\0")[0] if "Metadata" in group else b"{}"
+    stated = held(group, "Metadata")[:, 0].tobytes().partition(b"\0")[0] if "Metadata" in group else b"{}"
     facts = json.loads(stated).get("BinaryResult", {})
     axes = []
     for name, side, size in zip("yx", ("height", "width"), dataset.shape, strict=False):
@@ -143,18 +144,18 @@ def _velox(group: Any, dataset: Any) -> list[Axis]:
     return [*axes, Axis("frame", dataset.shape[2], None, "", "t")]
 
 
-def _nexus_scaling(group: Any, name: str) -> dict[str, Any]:
+def _nexus_scaling(group: Any, name: str, held: Held) -> dict[str, Any]:
     """Return the scaling of an NXdata field, ``(value + offset) * scaling_factor``, as CF has it."""
     factor, offset = (
-        float(np.ravel(group.get(f"{name}_{key}", group.get(key, plain)))[0])
+        float(np.ravel(next((one for k in (f"{name}_{key}", key) if (one := held(group, k)) is not None), plain))[0])
         for key, plain in (("scaling_factor", 1.0), ("offset", 0.0))
     )
     return {"scale_factor": factor, "add_offset": offset * factor} if (factor, offset) != (1, 0) else {}
 
 
-def _dream3d(geometry: Any, dataset: Any) -> list[Axis]:
+def _dream3d(above: Any, dataset: Any, held: Held) -> list[Axis]:
     """Return the axes of cells of DREAM.3D, whose origin is a corner; spacing and origin are in the order x, y, z."""
-    steps, first = (np.ravel(geometry[key])[::-1] for key in ("SPACING", "ORIGIN"))
+    steps, first = (np.ravel(held(above, f"_SIMPL_GEOMETRY/{key}"))[::-1] for key in ("SPACING", "ORIGIN"))
     spatial = _even("zyx", dataset.shape, first + steps / 2, steps)
     return [*spatial, *(Axis("components", n, None, "", "c") for n in dataset.shape[3:])]
 

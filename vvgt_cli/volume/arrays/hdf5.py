@@ -54,9 +54,9 @@ def read_dataset(path: Path, options: ReadOptions) -> Volume:
         name = f"{volume_name(path)}:{dataset.name.strip('/')}"
         attributes = {key: dataset.attrs[key] for key in ATTRIBUTES if key in dataset.attrs}
         attributes |= {key: up.attrs[key] for up in (file, dataset.parent) for key in GEOMETRY if key in up.attrs}
-        axes = scaled_axes(dataset)
+        axes, held = scaled_axes(dataset), partial(held_dataset, h5py, path)
         if not any(a.name or a.centres is not None for a in axes):
-            axes, more = conventional_axes(file, dataset, source) or (axes, {})
+            axes, more = conventional_axes(file, dataset, source, held) or (axes, {})
             attributes |= more
         attributes |= flags_of(h5py.check_enum_dtype(dataset.dtype))
         axes = with_neighbours(axes, _beside(h5py, dataset, path), source, options.spacing is not None)
@@ -65,7 +65,7 @@ def read_dataset(path: Path, options: ReadOptions) -> Volume:
         if mapped is None and options.stored:
             stored = partial(read_part, path, dataset.name)
         volume = labelled_volume(stored, dataset.dtype, axes, attributes, options, source, name, chunks)
-        return turned_by_itk(dataset.parent, volume)
+        return turned_by_itk(dataset.parent, volume, held)
 
 
 def _warn_of_xdmf(path: Path, axes: list[Axis], options: ReadOptions) -> None:
@@ -78,11 +78,18 @@ def _warn_of_xdmf(path: Path, axes: list[Axis], options: ReadOptions) -> None:
 
 def checked_dataset(h5py: Any, file: Any, path: Path, name: str) -> Any:
     """Return a dataset whose values can be read, by a path that leads into no file elsewhere."""
-    _check_links(h5py, file, name, path)
-    if not isinstance(file.get(name), h5py.Dataset):
+    if (dataset := held_dataset(h5py, path, file, name)) is None:
         raise DataError(f"{path}:/{name}: no dataset; check that the file is whole")
-    check_storage(h5py, file[name], path, f"{path}:/{name}")
-    return file[name]
+    return dataset
+
+
+def held_dataset(h5py: Any, path: Path, group: Any, name: str) -> Any:
+    """Return a dataset in a group as `checked_dataset` does, None where there is none."""
+    _check_links(h5py, group, name, path)
+    if not isinstance(dataset := group.get(name), h5py.Dataset):
+        return None
+    check_storage(h5py, dataset, path, f"{path}:{printable(dataset.name)}")
+    return dataset
 
 
 def _choose(h5py: Any, file: Any, wanted: str | None, path: Path) -> Any:
@@ -138,12 +145,14 @@ def _beside(h5py: Any, dataset: Any, path: Path) -> dict[str, Neighbour]:
 
 
 def _check_links(h5py: Any, file: Any, wanted: str, path: Path) -> None:
-    """Refuse a path that leads into another file outside of this one's folder."""
-    place = file
+    """Refuse a path, from a file or a group, that leads into another file outside of this one's folder."""
+    place = file.file if wanted.startswith("/") else file
     for part in wanted.strip("/").split("/"):
         link = place.get(part, getlink=True) if isinstance(place, h5py.Group) else None
         if isinstance(link, h5py.ExternalLink):
             data_file(path, link.filename, exact=True)
+        if isinstance(link, h5py.SoftLink):
+            _check_links(h5py, place, link.path, path)
         place = place.get(part) if link is not None else None
 
 

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import math
 import mmap
+import os
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -54,7 +56,7 @@ def read_netcdf(path: Path, options: ReadOptions) -> Volume:
         name = f"{volume_name(path)}:{variable.name}"
         where = f"{variable.group().path.rstrip('/')}/{variable.name}"
         by_box = options.stored and options.dims is None and options.component != "magnitude"
-        read = partial(_part, path, where) if by_box else lambda index: variable[index]
+        read = _later(path, where) if by_box else lambda index: variable[index]
         chunks = _chunks(variable) if by_box else None
         return labelled_volume(read, np.dtype(variable.dtype), axes, attributes, options, source, name, chunks)
 
@@ -82,13 +84,21 @@ def _refuse_mesh(beside: dict[str, Neighbour], source: str) -> None:
         )
 
 
-def _part(path: Path, where: str, index: tuple[Any, ...]) -> np.ndarray:
-    """Read a part of a variable from a file that is open no longer than that."""
+def _later(path: Path, where: str) -> Callable[[tuple[Any, ...]], np.ndarray]:
+    """Return what reads parts of a variable: it opens the file once in each process, until it is let go of."""
     import netCDF4
 
-    with _TURN, netCDF4.Dataset(str(path), "r") as file:
+    @cache
+    def opened(process: int) -> Any:
+        file = netCDF4.Dataset(str(path), "r")
         file.set_auto_maskandscale(False)
-        return np.asarray(file[where][index])
+        return file
+
+    def read(index: tuple[Any, ...]) -> np.ndarray:
+        with _TURN:
+            return np.asarray(opened(os.getpid())[where][index])
+
+    return read
 
 
 def _chunks(variable: Any) -> list[int]:

@@ -17,9 +17,10 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.arrays.hdf5 import checked_dataset
 from vvgt_cli.volume.arrays.netcdf import check_header
+from vvgt_cli.volume.components import choose_component
 from vvgt_cli.volume.libraries import need, read_part
 from vvgt_cli.volume.readers import HDF5, volume_name
-from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, magnitude, placed, select_component, text_of
+from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, magnitude, placed, text_of
 from vvgt_cli.volume.space import MILLIMETRE, metres, one_unit
 from vvgt_cli.volume.stored import Slices, give_back, stored_or_loaded
 
@@ -139,8 +140,8 @@ def _volume(image: _Image, path: Path, options: ReadOptions) -> Volume:
         )
     n, shape = math.prod(image.shape[k] for k in parts), tuple(image.shape[k] for k in spatial)
     fixed = dict.fromkeys(times, options.step(image.shape[times[0]] if times else 1, str(path)))
-    select_component(np.zeros((1, 1, 1, n)), options.component, str(path), label="each voxel")  # or raise
-    chosen = range(n) if options.component == "magnitude" else [int(options.component or 0)]
+    component = choose_component(n, image.dtype, options.component, f"{path}: each voxel has")
+    chosen = range(n) if component is None else [component]
     read = [_scaled(image, spatial, fixed | dict.fromkeys(parts, k), path) for k in chosen]
 
     def norm(slices: Slices) -> np.ndarray:

@@ -18,7 +18,8 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError, VvgtError
-from vvgt_cli.volume.microscopy.image import MAX_XML, choose_channel, choose_image, safe_xml
+from vvgt_cli.volume.components import choose_component
+from vvgt_cli.volume.microscopy.image import MAX_XML, choose_image, safe_xml
 from vvgt_cli.volume.readers import HEAD_BYTES, lazy
 from vvgt_cli.volume.reading import ReadOptions, Volume, magnitude, need, printable
 from vvgt_cli.volume.space import one_unit, placed
@@ -152,7 +153,7 @@ def _read(bdv: _Dataset, options: ReadOptions) -> Volume:
         setups = [one for one in setups if one.image == chosen]
     time, names = bdv.times[options.step(len(bdv.times), source)], [one.name for one in setups]
     kind = bdv.read(bdv.present(time, setups[0]), 0).data.dtype
-    channel = choose_channel(len(setups), names, kind, options.component, source)
+    channel = choose_component(len(setups), kind, options.component, f"{source}:", names, channels=True)
     if channel is not None:
         volume = _view(bdv, time, setups[channel], options)
         return volume if options.stored else loaded(volume)

@@ -16,9 +16,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, UsageError
+from vvgt_cli.errors import DataError, SeveralArrays, UsageError
 from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory
-from vvgt_cli.volume.components import contiguous, listed, magnitude
+from vvgt_cli.volume.components import choose_component, contiguous, listed, magnitude
 from vvgt_cli.volume.reading import ReadOptions, Volume, placed
 from vvgt_cli.volume.stored import Slices, stored_or_loaded
 
@@ -71,8 +71,8 @@ def picture_volume(picture: Micrograph, options: ReadOptions, source: str, name:
     """
     if min(picture.times, picture.channels, *picture.shape) < 1 or picture.dtype.kind not in "iufb":
         raise DataError(f"{source}: {picture.shape} values of type {picture.dtype}; expected integers or floats, z y x")
-    channel = choose_channel(
-        picture.channels, picture.names, picture.dtype, options.component, source, picture.colors, picture.rgb,
+    channel = choose_component(
+        picture.channels, picture.dtype, options.component, f"{source}:", picture.names, picture.colors, picture.rgb,
         not (picture.rgb or picture.samples),
     )  # fmt: skip
     what = "time steps" if picture.shape[0] > 1 else "time steps of one slice each"
@@ -104,40 +104,6 @@ def picture_volume(picture: Micrograph, options: ReadOptions, source: str, name:
             f"{source}: no voxel size along {axes}; taken as {across:g} (--spacing X Y Z sets it)", stacklevel=3
         )
     return placed(field, np.diag([s or across for s in sizes]), picture.origin, options, name, unit=unit)
-
-
-def choose_channel(
-    n: int, names: Sequence[str], dtype: np.dtype, wanted: int | str | None, source: str,
-    colors: Sequence[Color] = (), rgb: bool = False, separate: bool = True,
-) -> int | None:  # fmt: skip
-    """Return the number of the channel asked for, or of the only one; None for the magnitude of all.
-
-    The channels may have names and ``colors``, RGB in [0, 1]. ``rgb``: they are red, green, blue and perhaps opacity;
-    ``separate``: they are channels of their own, not samples of pixels.
-
-    Raises:
-        SeveralComponents: several and none chosen.
-        UsageError: none such.
-    """
-    names = [*names] if len(names) == n and any(names) else []
-    if wanted == "magnitude" and n > 1:
-        return None
-    if isinstance(wanted, str) and names.count(wanted) == 1:
-        return names.index(wanted)
-    if wanted is None and n == 1:
-        return 0
-    if isinstance(wanted, int) and wanted < n:
-        return wanted
-    listing = listed([f"{k} {name[:40]!r}" for k, name in enumerate(names)], ", ") if names else ""
-    what = f"{source}: {n} channel{'s' * (n > 1)}{f' ({listing})' if listing else ''} of type {dtype}"
-    if n == 1:
-        raise UsageError(f"{what}; leave out --channel {wanted}")
-    expected = f"expected one: try --channel 0 to {n - 1}, a name, all, or --component magnitude"
-    if wanted is not None:
-        raise UsageError(f"{what}, not {wanted!r}; {expected}")
-    raise SeveralComponents(
-        f"{what}; {expected}", n, rgb and n in (3, 4), colors if len(colors) == n else (), separate, names
-    )
 
 
 def choose_image(
