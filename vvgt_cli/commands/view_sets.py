@@ -32,7 +32,7 @@ from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.field.source import SourceRequest, StyledVolume
 from vvgt_cli.files import atomic_write, claim
 from vvgt_cli.gaussians.outputs import check_folder
-from vvgt_cli.images import contact_sheet, over, write_exr, write_png
+from vvgt_cli.images import as_png, contact_sheet, over, write_exr, write_png
 from vvgt_cli.images.files import read_view
 from vvgt_cli.jit.ahead import VIEWS
 from vvgt_cli.library.inputs import PathLike
@@ -91,10 +91,9 @@ class Layout:
         """Return the suffix of the images that `transforms.json` names."""
         return ".exr" if self.format == "exr" else ".png"
 
-    @property
-    def exact(self) -> bool:
-        """Return whether a view's pixels are stored as they were rendered."""
-        return self.format != "png" and not self.half
+    def stored(self, image: np.ndarray) -> np.ndarray:
+        """Return a view's image (h, w, 4) float32 premultiplied as `read_view` reads it from its file."""
+        return as_png(image) if self.format == "png" else image.astype(np.float16 if self.half else np.float32)
 
     def files(self, view: View) -> list[str]:
         """Return the relative paths of a view's images."""
@@ -494,9 +493,8 @@ def _render(run: Run, one: _Set, draw: Draw) -> None:
 
 
 def _keep(one: _Set, view: View, image: np.ndarray) -> list[str]:
-    """Write a view's images, keep its thumbnail if no pixel is rounded, and return the relative paths."""
-    if one.layout.exact:
-        one.small[view.stem] = thumbnail(image, view.camera)
+    """Write a view's images, keep its thumbnail, and return the relative paths."""
+    one.small[view.stem] = thumbnail(one.layout.stored(image).astype(np.float32), view.camera)
     return one.layout.write(one.folder, view, image)
 
 
