@@ -49,6 +49,16 @@ def test_a_missing_and_a_cut_and_a_changed_file_are_made_again(vvgt, copied, mad
     assert {"train_001.exr", "test_000.png", "points3d.ply", "transforms.json"} <= {path.name for path in kept}
 
 
+@pytest.mark.parametrize("stored", [("--format", "png"), ("--format", "exr", "--half")])
+def test_a_contact_sheet_made_again_is_the_same(vvgt, tmp_path, stored):
+    call = (*BASE, *stored, "--no-points", "-o", tmp_path)
+    vvgt.ok(*call)
+    sheet = (tmp_path / "contact.png").read_bytes()  # of views in memory
+    (tmp_path / "contact.png").unlink()
+    vvgt.ok(*call)  # of those on disk
+    assert (tmp_path / "contact.png").read_bytes() == sheet
+
+
 def test_a_run_that_is_killed_goes_on(vvgt, tmp_path, made, monkeypatch):
     drawn, real = [], dvr.render_view
 

@@ -34,7 +34,7 @@ from vvgt_cli.files import atomic_write, claim
 from vvgt_cli.gaussians.outputs import check_folder
 from vvgt_cli.images import as_png, contact_sheet, over, write_exr, write_png
 from vvgt_cli.images.files import read_view
-from vvgt_cli.jit.ahead import VIEWS
+from vvgt_cli.jit.ahead import RAYCAST, VIEWS
 from vvgt_cli.library.inputs import PathLike
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
@@ -306,7 +306,7 @@ class _Set:
 
 def open_looks(
     run: Run, requests: Sequence[SourceRequest], blocks: BlockOptions | None, folders: Sequence[Path] | None,
-    size: int, rays: Rays, stack: ExitStack,
+    size: int, rays: Rays, kernels: tuple[str, ...], stack: ExitStack,
 ) -> list[Field]:  # fmt: skip
     """Return a volume under each of several looks, which ``stack`` closes.
 
@@ -317,6 +317,7 @@ def open_looks(
         folders: blocks are kept beside them, one a look; None: in a temporary folder, for one.
         size: px, height of a view.
         rays: renderer, of which "vtk" needs the volume in memory, and device.
+        kernels: of `vvgt_cli.jit.ahead`, to compile on a first run.
         stack: closes what is opened.
 
     Raises:
@@ -329,7 +330,7 @@ def open_looks(
     fields = []
     for request, folder in zip(requests, folders or [Path()], strict=True):
         store, needs = store_beside(str(folder) if folders else None), FieldNeeds(POINTS, size)
-        fields.append(stack.enter_context(opened_upright(run, request, blocks, needs, VIEWS, store, rays.device)))
+        fields.append(stack.enter_context(opened_upright(run, request, blocks, needs, kernels, store, rays.device)))
     return fields
 
 
@@ -369,7 +370,7 @@ def render_looks(
         )
     with ExitStack() as stack:
         asked, height = list(requests.values()), cameras[0].height
-        (field,) = open_looks(run, asked, blocks, None, height, rays, stack)
+        (field,) = open_looks(run, asked, blocks, None, height, rays, RAYCAST, stack)
         draw = prepare(field, rays, cameras)
         return cameras, np.stack([draw(camera) for camera in cameras])
 
@@ -387,7 +388,8 @@ def write_views(
     folders, asked = folders_of(output, list(requests)), list(requests.values())
     rays, shard = rays or Rays(), shard or Shard()
     with ExitStack() as stack:
-        fields = open_looks(run, asked, blocks, folders, views[0].camera.height, rays, stack)
+        kernels = VIEWS if layout.points else RAYCAST
+        fields = open_looks(run, asked, blocks, folders, views[0].camera.height, rays, kernels, stack)
         with run.stage("plan") as stage:
             sets = _plan(fields, folders, views, layout, rays, shard, overwrite)
             total = sum(len(one.pending) for one in sets)

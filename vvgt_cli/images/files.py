@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-import tempfile
+import struct
+import zlib
 from dataclasses import asdict
 from os import PathLike
 from pathlib import Path
@@ -192,30 +193,28 @@ def write_png(path: str | PathLike[str], image: np.ndarray, overwrite: bool = Fa
         DataError: the shape is wrong, or the file cannot be written.
         UsageError: the file exists and ``overwrite`` is not set.
     """
-    import OpenImageIO as oiio
-
-    pixels = _bytes(image)
-    height, width, channels = pixels.shape
-    spec = oiio.ImageSpec(width, height, channels, oiio.UINT8)
-    spec.attribute("oiio:UnassociatedAlpha", 1)  # alpha is straight already: the writer must not divide again
-    spec.attribute("oiio:ColorSpace", "sRGB")
-    spec.attribute("compression", "rle")  # with Paeth's filter, runs and Huffman's code find what level 3 does, sooner
-    spec.attribute("png:filter", 128)  # PNG_FILTER_PAETH
+    encoded = png_bytes(image)
     with atomic_write(path, overwrite) as temporary:
-        output = oiio.ImageOutput.create("png")
-        if output is None or not output.open(str(temporary), spec):
-            raise DataError(f"{path}: cannot be written ({output.geterror() if output else oiio.geterror()})")
-        written = output.write_image(pixels)
-        if not (output.close() and written):
-            raise DataError(f"{path}: cannot be written ({output.geterror()})")
+        temporary.write_bytes(encoded)
 
 
 def png_bytes(image: np.ndarray) -> bytes:
-    """Encode an image as PNG in memory, for notebooks and browsers; see `write_png`."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "image.png"
-        write_png(path, image)
-        return path.read_bytes()
+    """Encode an image as PNG in memory, for notebooks and browsers; see `write_png`.
+
+    Runs of differences from the mean of the pixels to the left and above are as small as zlib's level 3, and packed in
+    a fifth of the time (docs/log/renderer.md).
+    """
+    pixels = _bytes(image)
+    height, width, channels = pixels.shape
+    left, above = np.zeros_like(pixels), np.zeros_like(pixels)
+    left[:, 1:], above[1:] = pixels[:, :-1], pixels[:-1]
+    rows = np.full((height, 1 + width * channels), 3, np.uint8)  # the filter's number, before each row
+    rows[:, 1:] = (pixels - ((left & above) + ((left ^ above) >> 1))).reshape(height, -1)
+    packer = zlib.compressobj(strategy=zlib.Z_RLE)
+    header = struct.pack(">2I5B", width, height, 8, 2 if channels == 3 else 6, 0, 0, 0)
+    chunks = {b"IHDR": header, b"sRGB": b"\3", b"IDAT": packer.compress(rows) + packer.flush(), b"IEND": b""}
+    parts = ((struct.pack(">I", len(data)), kind + data) for kind, data in chunks.items())
+    return b"\x89PNG\r\n\x1a\n" + b"".join(size + part + struct.pack(">I", zlib.crc32(part)) for size, part in parts)
 
 
 def as_png(image: np.ndarray) -> np.ndarray:
