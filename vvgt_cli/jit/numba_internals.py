@@ -21,7 +21,7 @@ from numba.core.callconv import excinfo_ptr_t
 from numba.core.codegen import JITCPUCodegen
 from numba.core.dispatcher import Dispatcher
 from numba.core.registry import cpu_target
-from numba.core.runtime import rtsys
+from numba.core.runtime.nrt import rtsys
 from numba.core.serialize import dumps
 from numba.np.ufunc.parallel import _launch_threads
 
