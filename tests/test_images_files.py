@@ -1,5 +1,6 @@
 """EXR and PNG files: what is written comes back, and nothing is lost or replaced unasked."""
 
+import resource
 import struct
 import zlib
 
@@ -9,7 +10,7 @@ import pytest
 from tests.refused import refused
 from vvgt_cli.cameras.sets import default_views
 from vvgt_cli.errors import DataError
-from vvgt_cli.images import read_exr, read_png, write_exr, write_png
+from vvgt_cli.images import as_png, read_exr, read_png, write_exr, write_png
 
 
 def rgba(height=9, width=13, seed=0):
@@ -111,6 +112,7 @@ def test_png_stores_straight_alpha(tmp_path):
     np.testing.assert_array_equal(stored[..., 3], straight[..., 3])
     np.testing.assert_array_equal(stored[..., :3] * seen, straight[..., :3] * seen)
     np.testing.assert_allclose(read_png(tmp_path / "a.png"), premultiplied, atol=1e-6)
+    np.testing.assert_array_equal(as_png(premultiplied), read_png(tmp_path / "a.png"))
 
 
 def _decode(path):
@@ -123,6 +125,17 @@ def _decode(path):
 def test_png_clips_and_survives_nan(tmp_path):
     write_png(tmp_path / "a.png", np.array([[[-1.0, 2.0, np.nan]]]))
     assert read_png(tmp_path / "a.png").tolist() == [[[0, 1, 0]]]
+
+
+def test_a_full_disk_leaves_no_part_of_a_picture(tmp_path):
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))  # a limit of file sizes stands for the disk
+    try:
+        for name, write in (("a.png", write_png), ("a.exr", write_exr)):
+            refused(DataError, rf"{name}: cannot be written .*File too large", write, tmp_path / name, rgba(99, 99))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("shape", [(4, 4), (4, 4, 2), (0, 4, 4), (4, 4, 5)])

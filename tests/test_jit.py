@@ -203,6 +203,7 @@ def test_commands_need_what_is_compiled_ahead_and_nothing_else(tmp_path, spied):
     assert set(ahead.BACK_PROJECT) <= few <= set(ahead.CONVERT)
     views = ("--views", 6, "--test-views", 2, "--size", 40, "-q", "-o", "views")
     assert wanted("render-views", SOURCE, *views) == set(ahead.VIEWS) - {ahead.BLOCK_MOMENTS}
+    assert wanted("render-views", SOURCE, *views[:-1], "bare", "--no-points") == set(ahead.RAYCAST)
     seen = ("a.ply", "--views", "views")
     alone = set(ahead.OPTIMIZE) - set(ahead.SHARED)
     assert wanted("optimize", *seen, "--steps", 3, "-qo", "c.ply") == alone

@@ -10,6 +10,8 @@ from tests.view_sets import BASE, SMALL, TF, VOLUME, make_views
 from vvgt_cli import dvr
 from vvgt_cli.conversion.manifest import read_manifest
 from vvgt_cli.errors import DataError
+from vvgt_cli.jit.ahead import RAYCAST
+from vvgt_cli.score.record import Run
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +49,16 @@ def test_a_missing_and_a_cut_and_a_changed_file_are_made_again(vvgt, copied, mad
     after = stamps(copied)
     kept = {path for path, stamp in before.items() if after[path] == stamp}
     assert {"train_001.exr", "test_000.png", "points3d.ply", "transforms.json"} <= {path.name for path in kept}
+
+
+@pytest.mark.parametrize("stored", [("--format", "png"), ("--format", "exr", "--half")])
+def test_a_contact_sheet_made_again_is_the_same(vvgt, tmp_path, stored):
+    call = (*BASE, *stored, "--no-points", "-o", tmp_path)
+    vvgt.ok(*call)
+    sheet = (tmp_path / "contact.png").read_bytes()  # of views in memory
+    (tmp_path / "contact.png").unlink()
+    vvgt.ok(*call)  # of those on disk
+    assert (tmp_path / "contact.png").read_bytes() == sheet
 
 
 def test_a_run_that_is_killed_goes_on(vvgt, tmp_path, made, monkeypatch):
@@ -166,9 +178,11 @@ def test_shards_together_are_the_whole(vvgt, tmp_path, made):
     assert "another" in vvgt("render-views", VOLUME, "--tf", "magma", *SMALL, "-o", folder, "--shard", "1/3").error
 
 
-def test_no_points_leaves_out_the_cloud_and_nothing_else(vvgt, tmp_path, made):
-    folder = tmp_path / "views"
+def test_no_points_leaves_out_the_cloud_and_nothing_else(vvgt, tmp_path, made, monkeypatch):
+    folder, compiled = tmp_path / "views", []
+    monkeypatch.setattr(Run, "compile", lambda self, kernels, volume=None: compiled.append(kernels))
     vvgt.ok(*BASE, "--no-points", "-o", folder)
+    assert compiled == [RAYCAST]
     names = {path.relative_to(made) for path in made.rglob("*.*") if path.is_file()}
     found = {path.relative_to(folder) for path in folder.rglob("*.*") if path.is_file()}
     assert {path.name for path in names - found} == {"points3d.ply"}

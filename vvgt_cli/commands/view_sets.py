@@ -32,9 +32,9 @@ from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.field.source import SourceRequest, StyledVolume
 from vvgt_cli.files import atomic_write, claim
 from vvgt_cli.gaussians.outputs import check_folder
-from vvgt_cli.images import contact_sheet, over, write_exr, write_png
+from vvgt_cli.images import as_png, contact_sheet, over, write_exr, write_png
 from vvgt_cli.images.files import read_view
-from vvgt_cli.jit.ahead import VIEWS
+from vvgt_cli.jit.ahead import RAYCAST, VIEWS
 from vvgt_cli.library.inputs import PathLike
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
@@ -91,10 +91,9 @@ class Layout:
         """Return the suffix of the images that `transforms.json` names."""
         return ".exr" if self.format == "exr" else ".png"
 
-    @property
-    def exact(self) -> bool:
-        """Return whether a view's pixels are stored as they were rendered."""
-        return self.format != "png" and not self.half
+    def stored(self, image: np.ndarray) -> np.ndarray:
+        """Return a view's image (h, w, 4) float32 premultiplied as `read_view` reads it from its file."""
+        return as_png(image) if self.format == "png" else image.astype(np.float16 if self.half else np.float32)
 
     def files(self, view: View) -> list[str]:
         """Return the relative paths of a view's images."""
@@ -307,7 +306,7 @@ class _Set:
 
 def open_looks(
     run: Run, requests: Sequence[SourceRequest], blocks: BlockOptions | None, folders: Sequence[Path] | None,
-    size: int, rays: Rays, stack: ExitStack,
+    size: int, rays: Rays, kernels: tuple[str, ...], stack: ExitStack,
 ) -> list[Field]:  # fmt: skip
     """Return a volume under each of several looks, which ``stack`` closes.
 
@@ -318,6 +317,7 @@ def open_looks(
         folders: blocks are kept beside them, one a look; None: in a temporary folder, for one.
         size: px, height of a view.
         rays: renderer, of which "vtk" needs the volume in memory, and device.
+        kernels: of `vvgt_cli.jit.ahead`, to compile on a first run.
         stack: closes what is opened.
 
     Raises:
@@ -330,7 +330,7 @@ def open_looks(
     fields = []
     for request, folder in zip(requests, folders or [Path()], strict=True):
         store, needs = store_beside(str(folder) if folders else None), FieldNeeds(POINTS, size)
-        fields.append(stack.enter_context(opened_upright(run, request, blocks, needs, VIEWS, store, rays.device)))
+        fields.append(stack.enter_context(opened_upright(run, request, blocks, needs, kernels, store, rays.device)))
     return fields
 
 
@@ -370,7 +370,7 @@ def render_looks(
         )
     with ExitStack() as stack:
         asked, height = list(requests.values()), cameras[0].height
-        (field,) = open_looks(run, asked, blocks, None, height, rays, stack)
+        (field,) = open_looks(run, asked, blocks, None, height, rays, RAYCAST, stack)
         draw = prepare(field, rays, cameras)
         return cameras, np.stack([draw(camera) for camera in cameras])
 
@@ -388,7 +388,8 @@ def write_views(
     folders, asked = folders_of(output, list(requests)), list(requests.values())
     rays, shard = rays or Rays(), shard or Shard()
     with ExitStack() as stack:
-        fields = open_looks(run, asked, blocks, folders, views[0].camera.height, rays, stack)
+        kernels = VIEWS if layout.points else RAYCAST
+        fields = open_looks(run, asked, blocks, folders, views[0].camera.height, rays, kernels, stack)
         with run.stage("plan") as stage:
             sets = _plan(fields, folders, views, layout, rays, shard, overwrite)
             total = sum(len(one.pending) for one in sets)
@@ -494,9 +495,8 @@ def _render(run: Run, one: _Set, draw: Draw) -> None:
 
 
 def _keep(one: _Set, view: View, image: np.ndarray) -> list[str]:
-    """Write a view's images, keep its thumbnail if no pixel is rounded, and return the relative paths."""
-    if one.layout.exact:
-        one.small[view.stem] = thumbnail(image, view.camera)
+    """Write a view's images, keep its thumbnail, and return the relative paths."""
+    one.small[view.stem] = thumbnail(one.layout.stored(image).astype(np.float32), view.camera)
     return one.layout.write(one.folder, view, image)
 
 

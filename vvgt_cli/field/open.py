@@ -327,8 +327,6 @@ def better_in_blocks(request: SourceRequest) -> bool:
     Raises:
         DataError, UsageError: see `read_volume`.
     """
-    from vvgt_cli.closed_form.closed_form import MAX_BASE_CELLS
-
     path, free = request.volume, free_memory()
     if not isinstance(path, str) or path == "-":
         return False
@@ -356,6 +354,8 @@ def better_in_blocks(request: SourceRequest) -> bool:
         return True
     if free is None:
         return False
+    from vvgt_cli.closed_form.closed_form import MAX_BASE_CELLS
+
     own = LAYER_VOXEL + 4 * len(volumes) if len(volumes) > 1 else OWN.get(volumes[0].data.dtype.name, 4)
     loaded = sum(volume.data.nbytes for volume in volumes if isinstance(volume.data, Stored))
     voxels = volumes[0].data.size

@@ -124,7 +124,6 @@ class KernelCache:
         """Return the compiled form of a signature, or None, which has numba compile it in this process."""
         if store.WORKING:
             return None
-        target_context.refresh()
         types = tuple(getattr(sig, "args", sig))
         file = self.file(types)
         payload = self.find(file)

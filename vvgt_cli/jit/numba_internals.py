@@ -21,6 +21,7 @@ from numba.core.callconv import excinfo_ptr_t
 from numba.core.codegen import JITCPUCodegen
 from numba.core.dispatcher import Dispatcher
 from numba.core.registry import cpu_target
+from numba.core.runtime.nrt import rtsys
 from numba.core.serialize import dumps
 from numba.np.ufunc.parallel import _launch_threads
 
@@ -78,7 +79,11 @@ def symbols_of(bitcode: bytes) -> bytes:
 
 
 def load_result(context: Any, payload: bytes) -> Any:
-    """Return the compiled kernel of `dump_result`, loaded into a target ``context``."""
+    """Return the compiled kernel of `dump_result`, loaded into a target ``context``.
+
+    It needs numba's runtime, not what numba can compile (`context.refresh`), whose import takes a sixth of a second.
+    """
+    rtsys.initialize(context)
     return compiler.CompileResult._rebuild(context, *pickle.loads(payload))
 
 
