@@ -216,8 +216,10 @@ def test_commands_need_what_is_compiled_ahead_and_nothing_else(tmp_path, spied):
     assert lit == set(ahead.for_degree(ahead.for_light(ahead.CONVERT, False), 2)) - rare
     np.save(tmp_path / "seg.npy", (np.indices((9, 9, 9)).sum(axis=0) // 9).astype(np.uint8))
     labels = wanted("convert", "seg.npy", *fit, "--steps", 24, "-o", "g.ply")
-    grid = ahead.for_grid(ahead.for_light(ahead.CONVERT, False))
+    grid = ahead.for_grid(ahead.for_light(ahead.CONVERT, False), mixed=False)
     assert labels == set(ahead.for_degree(grid, 2)) - {*ahead.REGRESS, ahead.MIX}  # of other grids, and of more
+    mixed = wanted("render", SOURCE, "--layer", "seg.npy,labels=none", "--light", "none", "--size", 24, "-qo", "m.png")
+    assert mixed == {*ahead.for_grid(ahead.RAYCAST, mixed=True), "vvgt_cli.dvr.place:place"}
     wanted("convert", "seg.npy", *fit, "--steps", 24, "--light", "sun", "--blocks", 16, "-o", "h.ply")
     live = wanted("convert", SOURCE, *fit, "--live", "-o", "l.ply")
     assert {*ahead.LIVE, *ahead.VOXELIZE} <= live

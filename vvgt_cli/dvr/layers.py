@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from vvgt_cli.dvr.layout import Mixture
+from vvgt_cli.dvr.layout import Mixture, Texels
 from vvgt_cli.errors import DataError
 from vvgt_cli.look import LabelTable, TransferFunction
 from vvgt_cli.look.tables import Optics, build_tables, extinction
@@ -187,7 +187,7 @@ def mixture_box(
     lengths per unit-frame length.
     """
     if not tables:
-        return Mixture.of(texels)
+        return Mixture(Texels(texels).values)
     inner, others = _scalars(layers), _others(layers)
     out = np.empty((len(inner), *texels.shape[:3]), np.float32)
     for layer, own, values in zip(inner, tables, out, strict=True):

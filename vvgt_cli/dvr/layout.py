@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -92,37 +92,37 @@ class Mixture(NamedTuple):
     Attributes:
         grid: (nz, ny, nx, 4) float32 extinction times (r, g, b, 1) per unit-frame length of labels and colours, as
             `Texels` holds it; one texel of zeros where there are none.
-        scalars: (K, nz, ny, nx) float32 coordinates in the tables, not clamped, of layers of scalars; NaN: unknown.
-        nodes, cumulative: (K, n + 1, 4) float64 tables, as of `Optics`.
+        scalars: (K, nz, ny, nx) float32 coordinates in the tables, not clamped, of layers of scalars, NaN: unknown;
+            None without such layers.
+        nodes, cumulative: (K, n + 1, 4) float64 tables, as of `Optics`; or None.
         dark, even: (K, n + 1) float64, the same.
     """
 
     grid: np.ndarray
-    scalars: np.ndarray
-    nodes: np.ndarray
-    cumulative: np.ndarray
-    dark: np.ndarray
-    even: np.ndarray
+    scalars: Any = None
+    nodes: Any = None
+    cumulative: Any = None
+    dark: Any = None
+    even: Any = None
 
     @classmethod
-    def of(cls, texels: np.ndarray, scalars: np.ndarray | None = None, tables: Sequence[Optics] = ()) -> Mixture:
+    def of(cls, texels: np.ndarray, scalars: np.ndarray, tables: Sequence[Optics]) -> Mixture:
         """Return the mixture of ``texels`` and of ``scalars`` under as many ``tables`` of one length."""
-        grid, shape = Texels(texels).values, (0, *texels.shape[:3])
-        if scalars is None or not tables:
-            none = np.zeros((0, 2, 4))
-            return cls(grid, np.zeros(shape, np.float32), none, none, none[..., 0], none[..., 0])
         if scalars.dtype != np.float32 or scalars.ndim != 4 or not scalars.flags.c_contiguous:
             raise ValueError(f"scalars {scalars.shape} of {scalars.dtype}; expected contiguous float32 (K, nz, ny, nx)")
-        return cls(grid, scalars, *(np.stack([getattr(one, name) for one in tables]) for name in cls._fields[2:]))
+        stacked = (np.stack([getattr(one, name) for one in tables]) for name in cls._fields[2:])
+        return cls(Texels(texels).values, scalars, *stacked)
 
     def part(self, index: tuple[slice, ...]) -> Mixture:
         """Return the voxels at ``index`` (z, y, x)."""
-        grid = self.grid if self.grid.size == 4 else np.ascontiguousarray(self.grid[index])
-        return self._replace(grid=grid, scalars=np.ascontiguousarray(self.scalars[(slice(None), *index)]))
+        whole = self.scalars is not None and self.grid.shape[:3] != self.scalars.shape[1:]
+        grid = self.grid if whole else np.ascontiguousarray(self.grid[index])
+        scalars = None if self.scalars is None else np.ascontiguousarray(self.scalars[(slice(None), *index)])
+        return self._replace(grid=grid, scalars=scalars)
 
     def fields(self) -> Iterator[tuple[np.ndarray, Optics]]:
         """Yield the scalars (nz, ny, nx) of each layer, read-only, and their tables."""
-        for values, nodes, cumulative, dark, even in zip(self.scalars, *self[2:], strict=True):
+        for values, nodes, cumulative, dark, even in zip(*self[1:], strict=True) if self.scalars is not None else ():
             values.flags.writeable = False
             yield values, Optics(0.0, 1.0, nodes, cumulative, dark, even, even)
 
@@ -159,5 +159,7 @@ class Light(NamedTuple):
 TUPLES: dict[type, str] = {Voxels: "V", Optics: "f8 f8 f8:2 f8:2 f8:1 f8:1 f8:1"}
 EXTINCTION: dict[type, str] = {**TUPLES, Voxels: "E"}
 LIT: dict[type, str] = {**TUPLES, Light: "f8 f8 f8 f8 i8 f8:2 f4:4 i8 f8 f8:1 f8:1"}
-GRID: dict[type, str] = {Texels: "f4:4", Mixture: "f4:4 f4:4 f8:3 f8:3 f8:2 f8:2"}
+GRID: dict[type, str] = {Texels: "f4:4"}
 LIT_GRID: dict[type, str] = {**LIT, **EXTINCTION, **GRID}
+UNMIXED: dict[type, str] = {Mixture: "f4:4 none none none none none"}
+MIXED: dict[type, str] = {Mixture: "f4:4 f4:4 f8:3 f8:3 f8:2 f8:2"}

@@ -9,7 +9,7 @@ Arguments: ``voxels`` and ``optics`` are `layout.Voxels` and `layout.Optics`; ``
 `layout.Mixture` of an optics grid, of which ``voxels`` and ``optics`` then hold the extinction; ``light`` is None or a
 `layout.Light`;
 ``empty`` (bz, by, bx) uint8 as `Scene.empty`. Which of them are None is known when a kernel is compiled: each of the
-eight kernels holds one loop.
+twelve kernels holds one loop.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from vvgt_cli.dvr.kernel import (
     texel_at,
     values_met,
 )
-from vvgt_cli.dvr.layout import LIT, LIT_GRID, TUPLES, Light, Mixture, Optics, Voxels
+from vvgt_cli.dvr.layout import LIT, LIT_GRID, MIXED, TUPLES, UNMIXED, Light, Mixture, Optics, Voxels
 from vvgt_cli.dvr.runs import RUN, Run, sample_run, stack_run
 from vvgt_cli.dvr.shading import shading
 from vvgt_cli.dvr.vectors import Quad, add, lane, scale, vector, zeros4
@@ -147,10 +147,11 @@ def _layer(mixture: Mixture, k: int) -> Optics:
 
 
 @_jit
-def _sample_layers(mixture: Mixture, x: float, y: float, z: float, out: Run) -> Quad:
+def _sample_layers(mixture: Mixture, scalars: Any, x: float, y: float, z: float, out: Run) -> Quad:
     """Write the table coordinate of each layer of scalars at voxel coordinates, -1: unknown; return the texel there."""
-    for k in range(mixture.scalars.shape[0]):
-        out[k] = table_coordinate(sample(mixture.scalars[k], x, y, z), _layer(mixture, k))
+    if scalars is not None:
+        for k in range(scalars.shape[0]):
+            out[k] = table_coordinate(sample(scalars[k], x, y, z), _layer(mixture, k))
     return texel_at(mixture.grid, x, y, z)
 
 
@@ -191,7 +192,7 @@ def _pass_layers(
     for n in range(1, parts + 1):
         s, c = t + n * part, b
         if n < parts:
-            c = _sample_layers(mixture, px + s * dx, py + s * dy, pz + s * dz, within)
+            c = _sample_layers(mixture, mixture.scalars, px + s * dx, py + s * dy, pz + s * dz, within)
         else:
             for k in range(count):
                 within[k] = now[k]
@@ -215,12 +216,14 @@ def _pass_layers(
 
 @_jit
 def _through_mixture(
-    mixture: Mixture, voxels: Voxels, empty: np.ndarray, light: Any, p: Vector, d: Vector,
+    mixture: Mixture, scalars: Any, voxels: Voxels, empty: np.ndarray, light: Any, p: Vector, d: Vector,
     t0: float, dt: float, first: int, last: int, step: float,
 ) -> tuple[float, float, float, float]:  # fmt: skip
-    """Return `_through_values` of an optics grid: along a segment the texels are linear."""
-    (px, py, pz), (dx, dy, dz) = p, d
-    count, shape = mixture.scalars.shape[0], voxels.values.shape
+    """Return `_through_values` of an optics grid: along a segment the texels are linear.
+
+    ``scalars``: those of the mixture.
+    """
+    (px, py, pz), (dx, dy, dz), shape = p, d, voxels.values.shape
     then, now, within, parts = stack_run(), stack_run(), stack_run(), stack_run()
     seen: Quad = zeros4()
     trans, red, green, blue = 1.0, 0.0, 0.0, 0.0
@@ -239,26 +242,27 @@ def _through_mixture(
                 known, i = False, start
             stop = i + LEAP
         t = t0 + i * dt
-        b = _sample_layers(mixture, px + t * dx, py + t * dy, pz + t * dz, now)
+        b = _sample_layers(mixture, scalars, px + t * dx, py + t * dy, pz + t * dz, now)
         here, ahead = t - dt, trans
         if not known:
-            for k in range(count):
-                then[k] = now[k]
+            if scalars is not None:
+                for k in range(scalars.shape[0]):
+                    then[k] = now[k]
         elif light is None:
-            if count > 0:
+            if scalars is not None:
                 seen, trans, _ = _pass_layers(mixture, p, d, here, dt, a, b, then, now, within, None, seen, trans)
             elif lane(a, 3) + lane(b, 3) > 0.0:
                 seen, trans = blend_texels(a, b, dt, seen, trans)
         else:
             own, s = zeros4(), t - 0.5 * dt
-            if count > 0:
+            if scalars is not None:
                 _, trans, s = _pass_layers(mixture, p, d, here, dt, a, b, then, now, within, parts, own, trans)
-                for k in range(count):
+                for k in range(scalars.shape[0]):
                     own = vector(parts[4 * k], parts[4 * k + 1], parts[4 * k + 2], parts[4 * k + 3])
                     if lane(own, 3) > 0.0:
-                        r, g, b_ = shade_segment(own, light, mixture.scalars[k], p, d, look, s, here, dt, ahead)
+                        r, g, b_ = shade_segment(own, light, scalars[k], p, d, look, s, here, dt, ahead)
                         red, green, blue = red + r, green + g, blue + b_
-                k = 4 * count
+                k = 4 * scalars.shape[0]
                 own = vector(parts[k], parts[k + 1], parts[k + 2], parts[k + 3])
             elif lane(a, 3) + lane(b, 3) > 0.0:
                 own, trans = blend_texels(a, b, dt, own, trans)
@@ -281,7 +285,7 @@ def _march(
     if mixture is None:
         return _through_values(voxels, optics, empty, light, p, d, t0, dt, first, last, step)
     else:  # noqa: RET505 - numba leaves out the branch that is not taken
-        return _through_mixture(mixture, voxels, empty, light, p, d, t0, dt, first, last, step)
+        return _through_mixture(mixture, mixture.scalars, voxels, empty, light, p, d, t0, dt, first, last, step)
 
 
 @_jit
@@ -461,17 +465,21 @@ VIEW, BLOCK = "f8:1 f8:2 f8:1 f8 i8:1 f8:2 b1:2 i8 f4:3", "f8:2 f8:1 f8:1 f8:2 f
 def _kernel(
     body: Callable[Concatenate[ThreadSlice, P], None], name: str, more: str, grid: str, light: str
 ) -> Callable[P, None]:
-    """Make the kernel ``name`` of a ``body``, for arguments of which ``grid`` and ``light`` may be none."""
-    types = f"Voxels Optics {grid} u1:3 {light} {more}"
-    tuples = LIT if grid == "none" else LIT_GRID
+    """Make the kernel ``name`` of a ``body`` for a ``grid``: "none", or "grid" without or "mixed" with scalars."""
+    types = f"Voxels Optics {'none' if grid == 'none' else 'Mixture'} u1:3 {light} {more}"
+    tuples = {"none": LIT, "grid": {**LIT_GRID, **UNMIXED}, "mixed": {**LIT_GRID, **MIXED}}[grid]
     return parallel_kernel(types, tuples, name=name, fastmath=FLAGS, error_model="numpy")(body)
 
 
 render_tiles = _kernel(_tiles, "render_tiles", VIEW, "none", "none")
 render_lit_tiles = _kernel(_tiles, "render_lit_tiles", VIEW, "none", "Light")
-render_grid_tiles = _kernel(_tiles, "render_grid_tiles", VIEW, "Mixture", "none")
-render_lit_grid_tiles = _kernel(_tiles, "render_lit_grid_tiles", VIEW, "Mixture", "Light")
+render_grid_tiles = _kernel(_tiles, "render_grid_tiles", VIEW, "grid", "none")
+render_lit_grid_tiles = _kernel(_tiles, "render_lit_grid_tiles", VIEW, "grid", "Light")
+render_mixed_tiles = _kernel(_tiles, "render_mixed_tiles", VIEW, "mixed", "none")
+render_lit_mixed_tiles = _kernel(_tiles, "render_lit_mixed_tiles", VIEW, "mixed", "Light")
 cast_segments = _kernel(_segments, "cast_segments", BLOCK, "none", "none")
 cast_lit_segments = _kernel(_segments, "cast_lit_segments", BLOCK, "none", "Light")
-cast_grid_segments = _kernel(_segments, "cast_grid_segments", BLOCK, "Mixture", "none")
-cast_lit_grid_segments = _kernel(_segments, "cast_lit_grid_segments", BLOCK, "Mixture", "Light")
+cast_grid_segments = _kernel(_segments, "cast_grid_segments", BLOCK, "grid", "none")
+cast_lit_grid_segments = _kernel(_segments, "cast_lit_grid_segments", BLOCK, "grid", "Light")
+cast_mixed_segments = _kernel(_segments, "cast_mixed_segments", BLOCK, "mixed", "none")
+cast_lit_mixed_segments = _kernel(_segments, "cast_lit_mixed_segments", BLOCK, "mixed", "Light")

@@ -59,7 +59,7 @@ def matter_at(scene: Scene, points: np.ndarray) -> Iterator[tuple[np.ndarray, np
 
     Extinction (n,) per unit-frame length, colour (n, 3), and the values (nz, ny, nx) that have its normals.
     """
-    if scene.mixture is None or not len(scene.mixture.scalars):
+    if scene.mixture is None or scene.mixture.scalars is None:
         yield *optics_at(scene, points), scene.relieved.values
         return
     yield *_parted(grid_values(scene.mixture.grid, points)), scene.relieved.values

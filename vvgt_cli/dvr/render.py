@@ -140,7 +140,10 @@ def host_rays(scene: Scene) -> Callable[..., None]:
     if scene.grid is None:
         kernel = march.render_tiles if scene.light is None else march.render_lit_tiles
         return partial(kernel, scene.voxels, scene.optics, None, scene.empty, scene.light)
-    kernel = march.render_grid_tiles if scene.light is None else march.render_lit_grid_tiles
+    if scene.mixed:
+        kernel = march.render_mixed_tiles if scene.light is None else march.render_lit_mixed_tiles
+    else:
+        kernel = march.render_grid_tiles if scene.light is None else march.render_lit_grid_tiles
     return partial(kernel, scene.relieved, scene.optics, scene.mixture, scene.empty, scene.light)
 
 

@@ -102,7 +102,12 @@ class Scene:
     @property
     def shaded(self) -> Voxels:
         """What the normals of all matter are taken from: `relieved`, or `values` where there are scalars, too."""
-        return self.voxels if self.mixture is not None and len(self.mixture.scalars) else self.relieved
+        return self.voxels if self.mixed else self.relieved
+
+    @property
+    def mixed(self) -> bool:
+        """Whether rays meet layers of scalars."""
+        return self.mixture is not None and self.mixture.scalars is not None
 
     @classmethod
     def build(

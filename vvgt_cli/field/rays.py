@@ -179,6 +179,8 @@ def caster(
     begin = box.begin.astype(np.float64)
     if box.mixture is None:
         kernel = march.cast_segments if light is None else march.cast_lit_segments
+    elif box.mixed:
+        kernel = march.cast_mixed_segments if light is None else march.cast_lit_mixed_segments
     else:
         kernel = march.cast_grid_segments if light is None else march.cast_lit_grid_segments
     lit = None if light is None else light._replace(origin=begin)

@@ -85,7 +85,12 @@ class VoxelBox:
     @property
     def shaded(self) -> Voxels:
         """`Scene.shaded` of the box."""
-        return self.voxels if self.mixture is not None and len(self.mixture.scalars) else self.relieved
+        return self.voxels if self.mixed else self.relieved
+
+    @property
+    def mixed(self) -> bool:
+        """Whether rays meet layers of scalars."""
+        return self.mixture is not None and self.mixture.scalars is not None
 
     @property
     def texels(self) -> Texels | None:

@@ -283,7 +283,7 @@ class StyledVolume:
         """Return the names of a command's kernels for this kind of scene and light."""
         light = self.lighting
         lit = names if light is None else for_light(names, light.sky is not None)
-        return for_grid(lit) if self.gridded else lit
+        return for_grid(lit, self.mixed) if self.gridded else lit
 
     def kernel_type(self) -> str:
         """Return the name of the type in which kernels read the volume's values."""

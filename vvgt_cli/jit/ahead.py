@@ -24,6 +24,11 @@ GRID = {
     BLOCK_MOMENTS: "vvgt_cli.closed_form.quadrature:grid_moments",
     PATHS[0]: "vvgt_cli.dvr.paths:gather_grid",
 }
+MIXED = {
+    **GRID,
+    RENDER: "vvgt_cli.dvr.march:render_mixed_tiles",
+    RENDER_LIT: "vvgt_cli.dvr.march:render_lit_mixed_tiles",
+}
 DRAW = (
     *(f"vvgt_cli.splat.kernel:{name}" for name in ("count_pairs", "sum_pairs", "file_pairs")),
     "vvgt_cli.splat.tiles:blend",
@@ -67,6 +72,8 @@ SEGMENTS = {
     RENDER_LIT: "vvgt_cli.dvr.march:cast_lit_segments",
     GRID[RENDER]: "vvgt_cli.dvr.march:cast_grid_segments",
     GRID[RENDER_LIT]: "vvgt_cli.dvr.march:cast_lit_grid_segments",
+    MIXED[RENDER]: "vvgt_cli.dvr.march:cast_mixed_segments",
+    MIXED[RENDER_LIT]: "vvgt_cli.dvr.march:cast_lit_mixed_segments",
 }
 CONVERT = (RENDER, AXES_STEPS, *CLOSED_FORM, *DRAW, *DESCENT, *REGRESS, *RAYCAST_REST, *BACK_PROJECT)
 LIVE = ("vvgt_cli.closed_form.gaussian_samples:sample_points",)
@@ -82,6 +89,8 @@ ALL = (
     *SHADE,
     *PATHS,
     *GRID.values(),
+    MIXED[RENDER],
+    MIXED[RENDER_LIT],
     "vvgt_cli.dvr.place:place",
     EXACT_AXES,
     VIEW_SLOPES,
@@ -114,9 +123,9 @@ def for_degree(names: tuple[str, ...], degree: int) -> tuple[str, ...]:
     return (*names, *slopes, VIEW_COLORS, *([FIELD_STEPS] if AXES_STEPS in names else []))
 
 
-def for_grid(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the kernels of a command whose scene is an optics grid."""
-    return tuple(GRID.get(name, name) for name in names)
+def for_grid(names: tuple[str, ...], mixed: bool) -> tuple[str, ...]:
+    """Return the kernels of a command whose scene is an optics grid, ``mixed`` with layers of scalars or not."""
+    return tuple((MIXED if mixed else GRID).get(name, name) for name in names)
 
 
 def for_blocks(names: tuple[str, ...]) -> tuple[str, ...]:
