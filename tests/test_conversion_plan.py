@@ -349,6 +349,11 @@ def test_enough_time_leaves_all_steps(tmp_path):
     assert (report.refinement["reason"], report.refinement["steps"]) == ("steps", 8)
 
 
+def test_a_report_is_of_all_test_views():
+    asked = ({}, {"report": "r.json"}, {"all_views": True})
+    assert [ConvertRequest(SOURCE, "a.ply", **one).scored_whole for one in asked] == [False, True, True]
+
+
 def test_a_dry_run_plans_and_writes_nothing(tmp_path):
     request = ConvertRequest(SOURCE, str(tmp_path / "a.ply"), SMALL)
     found = plan_of(request, Console(quiet=True))
