@@ -344,6 +344,16 @@ def test_no_time_leaves_the_closed_form(tmp_path):
     assert len(read_ply(tmp_path / "a.ply")[0]) == report.gaussians > 0
 
 
+def test_enough_time_leaves_all_steps(tmp_path):
+    report = done(tmp_path, replace(SMALL, steps=8, time_budget=600.0))
+    assert (report.refinement["reason"], report.refinement["steps"]) == ("steps", 8)
+
+
+def test_a_report_is_of_all_test_views():
+    asked = ({}, {"report": "r.json"}, {"all_views": True})
+    assert [ConvertRequest(SOURCE, "a.ply", **one).scored_whole for one in asked] == [False, True, True]
+
+
 def test_a_dry_run_plans_and_writes_nothing(tmp_path):
     request = ConvertRequest(SOURCE, str(tmp_path / "a.ply"), SMALL)
     found = plan_of(request, Console(quiet=True))

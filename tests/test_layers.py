@@ -476,10 +476,13 @@ def test_a_scan_with_its_segmentation(vvgt, tmp_path: Path) -> None:
     assert out.read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
-def test_in_python() -> None:
+def test_in_python(tmp_path: Path) -> None:
     few = {"max_gaussians": 100, "screen": 32, "steps": 0}
     part = library.convert(cloud().data, **few, crop="2:8,:,:", mask=np.ones((10, 12, 14)))
     assert part.gaussians.means.shape[1] == 3
+    np.save(tmp_path / "m.npy", np.arange(10 * 12 * 14).reshape(10, 12, 14) % 2)
+    masked = [library.read_volume(cloud().data, mask=m).data for m in (np.load(tmp_path / "m.npy"), tmp_path / "m.npy")]
+    np.testing.assert_array_equal(*masked)
     request = SourceRequest(Volume(balls(12)), labels="auto")
     both = library.convert(Volume(balls(12).astype(np.float32)), library.Look("gray", layers=[request]), **few)
     assert np.ptp(both.gaussians.colors) > 0.1

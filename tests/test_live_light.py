@@ -93,14 +93,19 @@ def lit_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_recolor_uses_the_given_light_or_that_of_the_file(vvgt, lit_file, tmp_path) -> None:
+def test_recolor_uses_the_given_light_or_that_of_the_function_or_the_file(vvgt, lit_file, tmp_path) -> None:
     _, header = read_ply(lit_file)
     assert (header.light, header.sh_degree) == (Lighting(), 2)
+    points = [{"x": 0, "rgb": [1, 0, 0], "opacity": 0.1}, {"x": 1, "rgb": [0, 1, 0], "opacity": 0.9}]
+    function = {"range": [0, 1], "points": points, "lighting": {"ambient": 0.3}}
+    (tmp_path / "f.json").write_text(json.dumps(function))
     found = {}
-    for name, more in {"as": (), "none": ("--light", "none"), "x": ("--light", "x", "--specular", 0)}.items():
+    lights = {"as": (), "f": ("--tf", tmp_path / "f.json"), "none": ("--light", "none")}
+    for name, more in (lights | {"x": ("--light", "x", "--specular", 0)}).items():
         vvgt.ok("recolor", lit_file, *more, "-o", tmp_path / f"{name}.ply")
         found[name] = read_ply(tmp_path / f"{name}.ply")
     assert found["as"][1].light == header.light
+    assert found["f"][1].light == Lighting(ambient=0.3)
     assert found["none"][1].light is None
     assert found["none"][0].harmonics is None
     assert found["x"][1].light == Lighting(False, ((1.0, 0.0, 0.0),), specular=0.0)

@@ -110,6 +110,7 @@ def test_the_page_opens_offline_and_shows_its_pictures(scene_report):
     assert reader.tags.count("svg") == len(FILES)
     assert found["machine"]["cpu"] in text
     assert f"vvgt {found['versions']['vvgt']}" in text
+    assert set(re.findall('<tr class="best"><td>(.*?)</td>', text)) == set(found["front"])
     held = json.loads(re.search(r'id="images">(.*?)</script>', text, re.S)[1])
     assert len(held["reference"]) == 2
     assert [own["name"] for own in held["runs"]] == [run["name"] for run in found["runs"]]

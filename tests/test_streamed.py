@@ -20,6 +20,8 @@ from vvgt_cli.conversion.cut import StoredGaussians, TileGaussians, save
 from vvgt_cli.conversion.index import named_files
 from vvgt_cli.conversion.level_selection import SEEN_FROM, VIEW_PIXELS, CutErrors, level_errors
 from vvgt_cli.conversion.levels import WrittenFiles, divide
+from vvgt_cli.conversion.parts import Refiner
+from vvgt_cli.conversion.request import FitOptions
 from vvgt_cli.defaults import STEPS
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.block_store import BlockStore
@@ -219,6 +221,10 @@ def test_levels_have_a_certificate_of_what_viewers_show(vvgt, volume: Path, tmp_
     assert shown["certificate"]["holds"]
     assert shown["certificate"]["psnr"] == pytest.approx(made["psnr"], abs=0.1)
     assert {"from 6", "from 1.2", "from 0.6"} < {one["where"] for one in shown["conditions"]}
+    line = ("evaluate", f"{out}#1", "--volume", volume, "--no-conditions", "--json")
+    assert json.loads(vvgt.ok(*line).out)["certificate"] is None  # of a level alone
+    vvgt.ok("view", f"{out}#0", "-o", tmp_path / "a.ply")
+    assert read_ply(tmp_path / "a.ply")[1].certificate is None
 
 
 def test_a_dry_run_of_levels_prints_their_plan_and_writes_nothing(vvgt, volume: Path, tmp_path: Path) -> None:
@@ -236,6 +242,15 @@ def test_a_network_runs_on_the_parts_of_levels(vvgt, volume: Path, folder: Path,
         read_manifest(tmp_path / "out" / "lod-meta.json")["counts"] == read_manifest(folder / "lod-meta.json")["counts"]
     )
     assert contents(tmp_path / "out")["0_0/means_l.webp"] != contents(folder)["0_0/means_l.webp"]
+
+
+def test_the_message_of_parts_says_what_happens_in_each() -> None:
+    told = [
+        Refiner(None, None, FitOptions(steps=steps, model=model, target_psnr=target)).text()
+        for steps, model, target in ((12, None, None), (400, None, 30.0), (0, "a", None), (9, "a", None))
+    ]
+    assert told == ["12 steps", "at most 400 steps", "the network", "the network and 9 steps"]
+    assert Refiner(None, None, FitOptions(steps=152), early=56).text() == "at most 152 steps"
 
 
 def test_an_interrupted_run_resumes_with_the_same_bytes(vvgt, volume, folder, tmp_path, monkeypatch) -> None:

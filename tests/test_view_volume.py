@@ -94,6 +94,10 @@ def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
+def test_the_first_page_spans_the_box_of_the_volume() -> None:
+    np.testing.assert_array_equal(hidden((1, 2, 3)).means, [[-1, -2, -3], [1, 2, 3]])
+
+
 def test_a_volume_is_shown_and_converted_for_the_pages_function(
     tmp_path: Path, temporary: Path, small_screen: None
 ) -> None:

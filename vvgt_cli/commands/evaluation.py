@@ -12,7 +12,14 @@ import numpy as np
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.conversion.certify import rounded_error, verify
-from vvgt_cli.conversion.gaussian_files import STDIN, file_rule, layout_of, levels_in_box, open_gaussians
+from vvgt_cli.conversion.gaussian_files import (
+    STDIN,
+    file_rule,
+    layout_of,
+    levels_in_box,
+    open_gaussians,
+    shown_levels,
+)
 from vvgt_cli.conversion.place import headset_axes, to_box_frame, upright_axes
 from vvgt_cli.conversion.place import preview as side_by_side
 from vvgt_cli.conversion.recolored import apply_function, light_of, looks_of
@@ -177,16 +184,16 @@ def score(
         screen, rule = screen or device.screen, rule or device.rule
     inputs = [*request.paths(), *([ply] if isinstance(ply, str) else [])]
     check_outputs(Output.of("--preview", preview, (".png",)), inputs, overwrite)
-    place = split_name(ply) if isinstance(ply, str) else None
-    if place is not None and place[1] in (None, VIEW):
-        ply = str(place[0])
-    gaussians, header = open_gaussians(ply)
+    manifest, chosen = (split_name(ply) if isinstance(ply, str) else None) or (None, None)
+    levels = manifest if chosen in (None, VIEW) else None
+    gaussians, header = open_gaussians(ply if levels is None else str(levels))
+    header = header if levels is None else shown_levels(levels)[2]  # with their certificate
     size, drawn = screen or header.screen_size or SIZE, file_rule(header, rule)
     with opened_as_recorded(run, request, gaussians, header, size, options) as field:
         volume = field.source.volume
         inside: Shown = to_box_frame(shown(gaussians, header, field.source, request), volume)
-        if place is not None and place[1] in (None, VIEW):
-            inside = levels_in_box(place[0], volume)
+        if levels is not None:
+            inside = levels_in_box(levels, volume)
         for remark in _doubts(header, field.source):
             run.console.message(f"{ply}: {remark}")
         function = tf_record(field.source, request)

@@ -10,6 +10,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, BinaryIO
 
@@ -64,12 +65,12 @@ def open_gaussians(source: str | BinaryIO, empty: bool = False) -> tuple[Gaussia
 
 
 def shown_levels(manifest: Path) -> tuple[Callable[..., Gaussians], Gaussians, PlyHeader]:
-    """Return what the engine shows of levels to a camera, the coarsest level (unit frame), and its header.
+    """Return what the engine shows of levels to a camera, the coarsest level (unit frame), and the header of all.
 
     The camera is in the unit frame, or in one that ``axes`` (3, 3) turn into it.
     """
     levels, name = StreamedLevels(manifest), str(manifest)
-    coarsest, header = gaussians_of(levels.level(str(levels.count - 1)), name)
+    coarsest, header = gaussians_of(replace(levels.level(str(levels.count - 1)), comments=levels.comments), name)
     turned = up_matrix(header.up)
 
     def seen(camera: Camera, axes: np.ndarray | None = None) -> Gaussians:

@@ -55,6 +55,12 @@ class Refiner:
     early: int | None = None
     distances: tuple[float, ...] = (RADIUS,)
 
+    def text(self) -> str:
+        """Return what happens in a part, for a message: a network, and the most steps where descent may end earlier."""
+        most = "at most " if self.early is not None or self.fit.target_psnr is not None else ""
+        steps = [f"{most}{self.fit.steps} steps"] if self.fit.steps else []
+        return " and ".join([*([] if self.fit.model is None else ["the network"]), *steps])
+
 
 @dataclass(frozen=True)
 class PartTask:
@@ -137,8 +143,8 @@ def make_parts(
     with run.stage(name) as stage:
         run_pass(task, name)
         workers, edge = run_pass.runner.workers, int((parts.width * cut.plan.grid.tile).max())
-        steps_of = "" if refiner is None else f"{refiner.fit.steps} steps in each of "
-        stage.note = f"{steps_of}{len(task)} parts of {edge} voxels" + (f", {workers} workers" if workers > 1 else "")
+        made = "" if refiner is None else f"{refiner.text()} in each of "
+        stage.note = f"{made}{len(task)} parts of {edge} voxels" + (f", {workers} workers" if workers > 1 else "")
     return StoredGaussians(cut.store, kind, parts.ends)
 
 

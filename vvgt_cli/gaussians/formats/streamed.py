@@ -20,6 +20,7 @@ import numpy as np
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians.formats.sog import IMAGES, META, splats_in
 from vvgt_cli.gaussians.formats.splats import ROW_BYTES, Splats, gaussians_of, joined
+from vvgt_cli.gaussians.header import CERTIFICATE
 from vvgt_cli.resources import free_memory
 
 MANIFEST = "lod-meta.json"
@@ -191,6 +192,7 @@ class StreamedLevels:
         path: path of the manifest.
         scale: factor of lengths relative to a `.ply` of the same Gaussians.
         count: number of levels.
+        comments: comments of all levels together.
     """
 
     path: Path
@@ -201,11 +203,13 @@ class StreamedLevels:
         self._nodes = nodes_of(self._manifest, self.path)
         self.count = int(self._manifest["lodLevels"])
         about, self.scale = placed(self._manifest)
-        self._comments = about.comments
+        self.comments = about.comments
         self._cached: dict[tuple[int, int, int], Splats] = {}  # by file, offset, count: those of the last view
 
     def level(self, chosen: str | None) -> Splats:
         """Read the Gaussians of a level, None for the finest; nodes without it use their next finer one.
+
+        They have no certificate, which describes all levels together.
 
         Raises:
             UsageError: there is no such level.
@@ -213,7 +217,8 @@ class StreamedLevels:
         """
         if chosen is not None and (not chosen.isdecimal() or int(chosen) >= self.count):
             raise UsageError(f"{self.path}#{chosen}: expected a level from 0 to {self.count - 1}, or #{VIEW} in render")
-        return self._at_levels([int(chosen or 0)] * len(self._nodes))
+        one = self._at_levels([int(chosen or 0)] * len(self._nodes))
+        return replace(one, comments=tuple(line for line in one.comments if line.split()[1:2] != [CERTIFICATE]))
 
     def seen_from(self, eye: np.ndarray, field: float) -> Splats:
         """Read the Gaussians that the engine shows from ``eye`` (3,), in the frame of a `.ply`, with ``field`` degrees.
@@ -250,7 +255,7 @@ class StreamedLevels:
             self._read(file, list(some))
         whole, smaller = joined([self._cached[key] for key in keys]), np.float32(self.scale)
         return replace(
-            whole, means=whole.means / smaller, log_scales=whole.log_scales - np.log(smaller), comments=self._comments
+            whole, means=whole.means / smaller, log_scales=whole.log_scales - np.log(smaller), comments=self.comments
         )
 
     def _read(self, file: int, keys: list[tuple[int, int, int]]) -> None:
