@@ -17,6 +17,7 @@ from vvgt_cli.dvr.render import FIT_VIEWS, BoxFrame, camera_arrays
 from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.field import Picture
 from vvgt_cli.field.grid import Boxes, piece_edge
+from vvgt_cli.field.layered import OpenedFile
 from vvgt_cli.field.open import FieldNeeds, blocked
 from vvgt_cli.field.rays import Bundle, front_to_back, meeting, pieces_of
 from vvgt_cli.field.settings import BlockOptions
@@ -78,6 +79,7 @@ KINDS = {
         ),
         3e-3,
     ),
+    "colours": (SourceRequest(OpenedFile(tuple(volume_of((40, 31, 36)) for _ in range(3)), color=True)), 3e-3),
 }  # fmt: skip
 
 

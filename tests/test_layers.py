@@ -392,6 +392,28 @@ def test_rays_classify_scalars_between_voxels(other: str, light: str) -> None:
     assert psnr(shown, twin) > 50  # 32 to 34 of a grid of classified voxels
 
 
+@pytest.mark.parametrize("slices", [1, 2, 4])
+def test_thin_layers_on_another_grid_are_as_thick_as_their_boxes(slices: int) -> None:
+    first = cloud((16, 16, 16))
+    plate = Volume(np.full((slices, 12, 12), 5.0, np.float32), origin=(2.2, 1.7, 6.3))
+    request = SourceRequest(first, band(9, 1, (1, 1, 1)), layers=(SourceRequest(plate, ramp(0, 10)),))
+    scene = load(request).scene()
+    views = default_views("train", size=40)
+    ours, twin = (
+        np.mean([render(scene, views[k])[..., 3].mean() for k in range(8)])
+        for render in (render_view, render_view_reference)
+    )
+    assert abs(ours / twin - 1) < 0.3 / slices
+
+
+def test_more_layers_of_scalars_than_rays_classify() -> None:
+    volume = cloud((9, 10, 11))
+    layers = tuple(SourceRequest(cloud((9, 10, 11)), ramp(0.1 * k, 1.5)) for k in range(9))
+    scene = load(SourceRequest(volume, ramp(0, 2), layers=layers)).scene()
+    view = default_views("train", size=40)[1]
+    assert psnr(render_view(scene, view, RenderSettings(samples=1)), render_view_reference(scene, view)) > 45
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 3e38])
 def test_layers_with_values_that_are_none_or_huge_stay_finite(value: float) -> None:
     first = cloud((9, 9, 9))

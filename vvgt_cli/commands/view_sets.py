@@ -398,7 +398,7 @@ def write_views(
             _work(run, one, rays)
             if isinstance(one.field, Blocked):
                 one.field.run_pass.store.remove()
-            vars(one.field).pop("scene", None)  # an optics grid takes 20 bytes a voxel
+            vars(one.field).pop("scene", None)  # an optics grid takes 20 bytes a voxel and more
 
 
 def _settings(layout: Layout, rays: Rays, views: Sequence[View], source: StyledVolume, content: str) -> dict[str, Any]:

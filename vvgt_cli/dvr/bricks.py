@@ -105,7 +105,7 @@ def empty_distance(ranges: np.ndarray, tables: Optics) -> np.ndarray:
 
 
 def empty_bricks(values: np.ndarray, tables: Optics, mixture: Mixture | None = None) -> np.ndarray:
-    """Return `empty_distance` of ``values`` (nz, ny, nx) and of what a mixture's scalars show between voxels."""
+    """Return `empty_distance` to bricks with extinction in ``values`` (nz, ny, nx) or in a layer of the mixture."""
     empty = empty_distance(brick_ranges(values), tables)
     for scalars, optics in mixture.fields() if mixture else ():
         np.minimum(empty, empty_distance(brick_ranges(scalars), optics), out=empty)

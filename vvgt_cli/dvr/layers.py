@@ -21,8 +21,8 @@ from vvgt_cli.volume.stored import read_block
 
 SAME = 1e-3  # voxels up to which two grids are one
 SLAB = 16  # slices that are laid out at once
-MAX_SCALARS = 7  # layers of scalars that rays classify, what `march` has room for; of more, voxels are
-FARTHEST = 1e30  # coordinate in a table: none is infinite
+MAX_SCALARS = 7  # layers that rays classify: `march` has room for so many; others are classified at voxels
+FARTHEST = 1e30  # largest coordinate in a table, so that all are finite
 MAX_FINER = 8  # times along an axis that a layer's voxels may refine the first volume's
 VOXEL_BYTES = 24  # of a scene: four float32, and extinction again, of labels under light also smoothed
 
@@ -134,7 +134,9 @@ def common_grid(layers: Sequence[Layer], stored: bool = False) -> Volume:
     shape = tuple(int(n * f) for n, f in zip(first.data.shape, finer[::-1], strict=True))
     spacing = triple(float(s / f) for s, f in zip(first.spacing, finer, strict=True))
     if not stored:
-        check_memory((VOXEL_BYTES + 4 * len(_scalars(layers))) * math.prod(shape), first.name)
+        inner = len(scalar_layers(layers))
+        mixed = 4 * inner + 16 * bool(inner and _others(layers))
+        check_memory((VOXEL_BYTES + mixed) * math.prod(shape), first.name)
     origin = tuple((first.affine @ [*((1 / finer - 1) / 2), 1.0])[:3].tolist())
     empty = np.broadcast_to(np.uint8(0), shape)
     return replace(first, data=empty, spacing=spacing, origin=origin, slope=1.0, intercept=0.0)
@@ -188,23 +190,26 @@ def mixture_box(
     """
     if not tables:
         return Mixture(Texels(texels).values)
-    inner, others = _scalars(layers), _others(layers)
+    inner, others = scalar_layers(layers), _others(layers)
     out = np.empty((len(inner), *texels.shape[:3]), np.float32)
     for layer, own, values in zip(inner, tables, out, strict=True):
-        places = (_values_in(layer, target, lo, hi) - own.lo) * own.inv_width
-        values[:] = np.where(np.isfinite(places), np.clip(places, -FARTHEST, FARTHEST), np.nan)
-    rest = grid_box(others, target, lo, hi) * np.float32(per_unit) if others else np.zeros((1, 1, 1, 4), np.float32)
+        for z in range(0, len(values), SLAB):
+            first, end = np.array([*lo[:2], lo[2] + z]), np.array([*hi[:2], min(lo[2] + z + SLAB, hi[2])])
+            places = (_values_in(layer, target, first, end, rim=0.5) - own.lo) * own.inv_width
+            values[z : z + SLAB] = np.where(np.isfinite(places), np.clip(places, -FARTHEST, FARTHEST), np.nan)
+    rest = grid_box(others, target, lo, hi) if others else np.zeros((1, 1, 1, 4), np.float32)
+    rest *= np.float32(per_unit)
     return Mixture.of(rest, out, tables)
 
 
-def _scalars(layers: Sequence[Layer]) -> list[Layer]:
+def scalar_layers(layers: Sequence[Layer]) -> list[Layer]:
     """Return the layers that rays interpolate before they classify them."""
     return [layer for layer in layers if layer.interpolated][:MAX_SCALARS]
 
 
 def _others(layers: Sequence[Layer]) -> list[Layer]:
     """Return the layers that are classified at voxels."""
-    inner = _scalars(layers)
+    inner = scalar_layers(layers)
     return [layer for layer in layers if all(layer is not one for one in inner)]
 
 
@@ -226,29 +231,32 @@ def scalar_tables(layers: Sequence[Layer], per_unit: float, voxel: float) -> lis
             layer.tf, ends, unit_distance=layer.unit_distance, world_per_unit=per_unit, voxel=voxel, bins=bins
         )
 
-    bins = max((made(layer, None).bins for layer in _scalars(layers)), default=0)
-    return [made(layer, bins) for layer in _scalars(layers)]
+    bins = max((made(layer, None).bins for layer in scalar_layers(layers)), default=0)
+    return [made(layer, bins) for layer in scalar_layers(layers)]
 
 
-def _values_in(layer: Layer, target: Volume, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
-    """Return a layer's data values at voxels ``lo`` to ``hi`` of ``target``: (z, y, x) float64, NaN outside of it."""
+def _values_in(layer: Layer, target: Volume, lo: np.ndarray, hi: np.ndarray, rim: float = 0.0) -> np.ndarray:
+    """Return a layer's data values at voxels ``lo`` to ``hi`` of ``target``: (z, y, x) float64, NaN outside of it.
+
+    The values go on for ``rim`` of the target's voxels: between a voxel that has none and one that has, rays meet none.
+    """
     volume = layer.volume
 
     def read(first: np.ndarray, last: np.ndarray) -> np.ndarray:
         return volume.slope * read_block(volume, first, last)[..., None].astype(np.float64) + volume.intercept
 
-    values = read(lo, hi) if same_grid(volume, target) else _placed(layer, target, lo, hi, read, np.nan)
+    values = read(lo, hi) if same_grid(volume, target) else _placed(layer, target, lo, hi, read, np.nan, rim)
     return values[..., 0]
 
 
 def _placed(
     layer: Layer, target: Volume, lo: np.ndarray, hi: np.ndarray,
-    read: Callable[[np.ndarray, np.ndarray], np.ndarray], outside: float,
+    read: Callable[[np.ndarray, np.ndarray], np.ndarray], outside: float, rim: float = 0.0,
 ) -> np.ndarray:  # fmt: skip
     """Return a layer on another grid, interpolated at voxels ``lo`` to ``hi`` of ``target``: (z, y, x, c) float64.
 
     ``read`` returns (z, y, x, c) of a box of the layer's voxels; of them what the target's box meets is read, with a
-    voxel around. ``outside`` is the value beyond the layer's box.
+    voxel around. ``outside`` is the value beyond the layer's box and ``rim`` of the target's voxels.
     """
     from vvgt_cli.dvr.place import place
 
@@ -261,5 +269,6 @@ def _placed(
         return np.full((*(hi - lo)[::-1], 1), outside)
     values = read(first, last).astype(np.float64)
     out = np.zeros((*(hi - lo)[::-1], values.shape[3]))
-    place(values, matrix, lo.astype(np.int64), first.astype(np.int64), dims.astype(np.int64), outside, out)
+    about = lo.astype(np.int64), first.astype(np.int64), dims.astype(np.int64)
+    place(values, matrix, *about, rim * np.abs(matrix[:, :3]).sum(axis=1), outside, out)
     return out

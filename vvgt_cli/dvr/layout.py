@@ -90,8 +90,8 @@ class Mixture(NamedTuple):
     """Layers of an optics grid as rays meet them: scalars are interpolated, then classified (docs/layers.md).
 
     Attributes:
-        grid: (nz, ny, nx, 4) float32 extinction times (r, g, b, 1) per unit-frame length of labels and colours, as
-            `Texels` holds it; one texel of zeros where there are none.
+        grid: (nz, ny, nx, 4) float32 extinction times (r, g, b, 1) per unit-frame length of labels, colours and what
+            else is classified at voxels, as `Texels` holds it; one texel of zeros where there is nothing.
         scalars: (K, nz, ny, nx) float32 coordinates in the tables, not clamped, of layers of scalars, NaN: unknown;
             None without such layers.
         nodes, cumulative: (K, n + 1, 4) float64 tables, as of `Optics`; or None.

@@ -175,7 +175,10 @@ def _pass_layers(
     total, shown, steep = scale(0.5, add(a, b)), lane(a, 3) + lane(b, 3) > 0.0, False
     for k in range(count):
         low, high = min(then[k], now[k]), max(then[k], now[k])
-        if low >= 0.0 and high > mixture.dark[k, U(int(low))]:
+        if low < 0.0:  # the face of a layer, or a voxel that is none, lies between
+            if high > mixture.dark[k, U(int(max(high, 0.0)))]:
+                shown = steep = True
+        elif high > mixture.dark[k, U(int(low))]:
             total, shown = add(total, _layer_mean(mixture, k, then[k], now[k])), True
             steep |= high > mixture.even[k, U(int(low))]
     if own is not None:

@@ -9,17 +9,17 @@ from vvgt_cli.jit.decorators import parallel_kernel
 from vvgt_cli.jit.threads import ThreadSlice, iterations
 
 
-@parallel_kernel("f8:4 f8:2 i8:1 i8:1 i8:1 f8 f8:4", fastmath=FLAGS, error_model="numpy")
+@parallel_kernel("f8:4 f8:2 i8:1 i8:1 i8:1 f8:1 f8 f8:4", fastmath=FLAGS, error_model="numpy")
 def place(
     thread: ThreadSlice,
-    values: np.ndarray, matrix: np.ndarray, lo: np.ndarray, first: np.ndarray, dims: np.ndarray, outside: float,
-    out: np.ndarray,
+    values: np.ndarray, matrix: np.ndarray, lo: np.ndarray, first: np.ndarray, dims: np.ndarray, rim: np.ndarray,
+    outside: float, out: np.ndarray,
 ) -> None:  # fmt: skip
     """Add samples of ``values`` (z, y, x, c), a part of a layer, to ``out`` (mz, my, mx, c), a part of the target.
 
     ``matrix`` (3, 4) float64 leads from voxel indices (x, y, z, 1) of the target to those of the layer, of ``dims``
-    voxels; ``lo`` and ``first`` (3,) are where ``out`` and ``values`` begin, (x, y, z). Beyond the layer's box
-    ``outside`` is added, in the rim of half a voxel the edge's.
+    voxels; ``lo`` and ``first`` (3,) are where ``out`` and ``values`` begin, (x, y, z). The edge's values go on for
+    half a voxel, to the face of the layer's box, and for ``rim`` (3,) of its voxels; beyond, ``outside`` is added.
     """
     nx, ny, nz, channels = dims[0], dims[1], dims[2], values.shape[3]
     mz, my, mx, _ = out.shape
@@ -30,8 +30,8 @@ def place(
                 x = matrix[0, 0] * u + matrix[0, 1] * v + matrix[0, 2] * w + matrix[0, 3]
                 y = matrix[1, 0] * u + matrix[1, 1] * v + matrix[1, 2] * w + matrix[1, 3]
                 z = matrix[2, 0] * u + matrix[2, 1] * v + matrix[2, 2] * w + matrix[2, 3]
-                inside = -0.5 <= x <= nx - 0.5 and -0.5 <= y <= ny - 0.5 and -0.5 <= z <= nz - 0.5
-                if not inside:
+                x_rim, y_rim, z_rim = 0.5 + rim[0], 0.5 + rim[1], 0.5 + rim[2]
+                if not (-x_rim <= x < nx - 1 + x_rim and -y_rim <= y < ny - 1 + y_rim and -z_rim <= z < nz - 1 + z_rim):
                     for c in range(channels):
                         out[k, j, i, c] += outside
                     continue

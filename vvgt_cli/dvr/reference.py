@@ -12,6 +12,7 @@ from typing import Any, cast
 import numpy as np
 
 from vvgt_cli.cameras import Camera
+from vvgt_cli.dvr.layers import scalar_layers
 from vvgt_cli.dvr.layout import corners
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.look.function import TransferFunction
@@ -63,7 +64,7 @@ def matter_at(scene: Scene, points: np.ndarray) -> Iterator[tuple[np.ndarray, np
         yield *optics_at(scene, points), scene.relieved.values
         return
     yield *_parted(grid_values(scene.mixture.grid, points)), scene.relieved.values
-    inner = [layer for layer in cast(Any, scene.tf).layers if layer.interpolated]
+    inner = scalar_layers(cast(Any, scene.tf).layers)
     for layer, values in zip(inner, scene.mixture.scalars, strict=True):
         matrix = np.linalg.inv(layer.volume.affine) @ scene.volume.affine
         at = points @ matrix[:3, :3].T + matrix[:3, 3]

@@ -61,7 +61,7 @@ class Scene:
             then hold its extinction alone.
         mixture: the same as rays meet it, which classify scalars between voxels.
         labels: the grid is one of labels alone.
-        smooth: labels, with or without layers of scalars, are all there is.
+        smooth: it holds labels, and beside them layers of scalars at most.
         relief: (nz, ny, nx) float32, `smoothed` extinction of such labels under light; else None.
         rays: draws in place of the CPU's kernels (`vvgt_cli.dvr.cuda`).
     """

@@ -179,7 +179,7 @@ class Layers:
     @cached_property
     def _tables(self) -> list[Optics]:
         step = hollow(self.grid, self.dims).unit_frame().step
-        return scalar_tables(self.layers, 1 / self.scale, float(np.mean(step)))
+        return scalar_tables(self._opened, 1 / self.scale, float(np.mean(step)))
 
     def box(self, lo: np.ndarray, hi: np.ndarray) -> VoxelBox:
         """Implement `Scalars.box`."""

@@ -116,8 +116,9 @@ def for_budget(workload: Workload, gaussians: int) -> Workload:
 def _volume_bytes(scene: Scene) -> int:
     """Return the bytes of the values and grids, and of the copy if the kernels need another type."""
     data, values = scene.volume.data, scene.values
-    grids = scene.grid, scene.relief, scene.mixture and scene.mixture.scalars
-    grid = sum(one.nbytes for one in grids if one is not None)
+    mixed = (scene.mixture.grid, scene.mixture.scalars) if scene.mixture and scene.mixed else ()
+    grids = scene.grid, scene.relief, *mixed
+    grid: int = sum(one.nbytes for one in grids if one is not None)
     return data.nbytes + grid + (0 if np.may_share_memory(data, values) else values.nbytes)
 
 

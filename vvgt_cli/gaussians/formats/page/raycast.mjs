@@ -77,7 +77,7 @@ vec3 smooth${k}(vec3 p) {
   return (g * n${k}) * mat3(m${k});
 }` : `float value${k}(vec3 p) {
   vec3 q = (m${k} * vec4(p, 1.0)).xyz;
-  return ${k ? '!within(q) ? -1.0 : ' : ''}f${k}.x + f${k}.y * texture(v${k}, q).r;
+  return ${k ? '!within(q) ? -1e4 : ' : ''}f${k}.x + f${k}.y * texture(v${k}, q).r;
 }
 vec3 gradient${k}(vec3 p) {
   vec3 e = 1.0 / n${k}, q = clamp((m${k} * vec4(p, 1.0)).xyz, 0.5 * e, 1.0 - 0.5 * e);
@@ -106,10 +106,11 @@ float greater(Sample a, Sample b) { return ${single ? 'max(a.s0, b.s0)' : '0.0'}
 // colour c of a segment from a to b under the light: each layer has its own normals
 vec3 lighted(vec3 c, Sample a, Sample b, vec3 p, vec3 d) {
   ${layers.length === 1 ? `return lit(c, ${layers[0].labels ? 'smooth' : 'gradient'}0(p), d);` : `vec3 plain = vec3(0.0), shaded = vec3(0.0);
+  float all = 0.0;
   vec4 one;
 ${each((k, { labels }) => `  one = optics${k}(a, b);
-  if (one.a > 0.0) { plain += one.rgb; shaded += one.a * lit(one.rgb / one.a, ${labels ? 'smooth' : 'gradient'}${k}(p), d); }`)}
-  return min(c * shaded / max(plain, vec3(1e-9)), vec3(1.0));`}
+  if (one.a > 0.0) { all += one.a; plain += one.rgb; shaded += one.a * lit(one.rgb / one.a, ${labels ? 'smooth' : 'gradient'}${k}(p), d); }`)}
+  return all > 0.0 ? clamp(c + (shaded - plain) / all, 0.0, 1.0) : c;`}
 }
 vec4 onFace(vec3 p) {
   vec4 seen = vec4(0.0);
