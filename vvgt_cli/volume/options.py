@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 import re
 from dataclasses import dataclass, replace
 from typing import Any
@@ -68,6 +69,8 @@ class ReadOptions:
             parse_dtype(self.dtype)
         if self.crop is not None:
             parse_crop(self.crop)
+        if hasattr(self.component, "__index__"):  # numpy's whole numbers too
+            object.__setattr__(self, "component", operator.index(self.component))
         dims, edges, part = self.dims, self.spacing, self.component
         positive = edges is None or (len(edges) == 3 and all(math.isfinite(s) and s > 0 for s in edges))
         for flag, value, good, expected in (
