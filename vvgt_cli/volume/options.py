@@ -6,7 +6,7 @@ import math
 import operator
 import re
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, SupportsIndex
 
 import numpy as np
 
@@ -69,7 +69,7 @@ class ReadOptions:
             parse_dtype(self.dtype)
         if self.crop is not None:
             parse_crop(self.crop)
-        if hasattr(self.component, "__index__"):  # numpy's whole numbers too
+        if isinstance(self.component, SupportsIndex):  # numpy's whole numbers too
             object.__setattr__(self, "component", operator.index(self.component))
         dims, edges, part = self.dims, self.spacing, self.component
         positive = edges is None or (len(edges) == 3 and all(math.isfinite(s) and s > 0 for s in edges))
