@@ -34,6 +34,7 @@ USED = {  # "module:name": its arguments, None for what is no function
     "numba.core.dispatcher:Dispatcher._compile_for_args": "self args kws",
     "numba.core.registry:cpu_target.target_context.refresh": "",
     "numba.core.registry:cpu_target.typing_context.refresh": "",
+    "numba.core.runtime.nrt:rtsys.initialize": "ctx",
     "numba.core.serialize:dumps": "obj",
     "numba.np.ufunc.parallel:_launch_threads": "",
 }

@@ -245,6 +245,7 @@ def test_wrong_views_and_options_are_refused(scene):
     ones = [np.ones(image.shape[:2], np.float32) for image in images]
     few = (*check[:2], None, [weight[:, :40] for weight in ones[: len(CHECKS)]])
     refused(DataError, "training views: weights", optimize, start, CAMERAS, images, weights=ones[:5])
+    optimize(start, CAMERAS, images, OptimizeOptions(steps=1), weights=np.stack(ones))
     refused(DataError, "check views: weights", optimize, start, CAMERAS, images, check=few)
     for wrong in (
         {"method": "sgd"},

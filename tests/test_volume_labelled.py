@@ -1,8 +1,10 @@
 """Arrays with named axes: HDF5, NetCDF, Zarr and NumPy, written by their own libraries."""
 
+import gc
 import itertools
 import json
 import sys
+import threading
 from pathlib import Path
 
 import h5py
@@ -15,7 +17,8 @@ from tests.ramps import X, Y, Z, check_grid, check_ramp, ramp
 from tests.refused import refused
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume import ReadOptions, read_volume
-from vvgt_cli.volume.arrays.netcdf import check_header
+from vvgt_cli.volume.arrays.hdf5 import read_dataset
+from vvgt_cli.volume.arrays.netcdf import _TURN, check_header
 from vvgt_cli.volume.labelled import even
 
 VALUES = ramp(X, Y, Z)
@@ -208,9 +211,67 @@ def test_hdf5_stays_in_its_folder(tmp_path: Path) -> None:
         file["link"], file["soft"] = h5py.ExternalLink("../outside.h5", "/field"), h5py.SoftLink("/link")
         file.create_virtual_dataset("virtual", layout)
         file.create_dataset("raw", (3, 4, 5), "f8", external=[("../outside.h5", 0, h5py.h5f.UNLIMITED)])
-    for name in ("link", "soft", "virtual", "raw"):
-        message = "other files" if name == "raw" else "own folder"
-        refused(DataError, message, read_volume, f"{path}:/{name}")
+        for name, there in (("far", "far"), ("near", "/virtual"), ("other", "field")):
+            file[name] = h5py.ExternalLink("beside.h5", there)
+        file["a"], file["b"] = h5py.SoftLink("/b"), h5py.SoftLink("/a")
+        nested = h5py.VirtualLayout((3, 4, 5), "f8")
+        nested[:] = h5py.VirtualSource("beside.h5", "virtual", (3, 4, 5))
+        file.create_virtual_dataset("nested", nested)
+    with h5py.File(path.with_name("beside.h5"), "w") as file:
+        file["before"], file["field"], file["far"] = VALUES[0], VALUES, h5py.ExternalLink("../outside.h5", "/field")
+        file.create_virtual_dataset("virtual", layout)
+    told = {"raw": "other files", "a": "too many links", "nested": "no values of its own"}
+    for name in ("link", "soft", "virtual", "raw", "far", "near", ".//link", "a", "nested"):
+        refused(DataError, told.get(name, "own folder"), read_volume, f"{path}:/{name}")
+    for stored in (False, True):
+        np.testing.assert_array_equal(read_volume(f"{path}:/other", ReadOptions(stored=stored)).data[:], VALUES)
+
+
+def test_scales_of_hdf5_stay_in_its_folder(tmp_path: Path) -> None:
+    (tmp_path / "outside.raw").write_bytes(np.arange(5.0).tobytes())
+    (tmp_path / "inner").mkdir()
+    path = tmp_path / "inner" / "v.h5"
+    with h5py.File(path, "w") as file:
+        file["field"] = VALUES
+        file.create_dataset("x", (5,), "f8", external=[("../outside.raw", 0, 40)]).make_scale()
+        file["field"].dims[2].attach_scale(file["x"])
+    refused(DataError, "external storage", read_volume, f"{path}:/field")
+
+
+@pytest.mark.parametrize("place", ["ITKImage/0/VoxelData", "c/p/v", "t00000/s00/0/cells", "Data/Image/1/Data"])
+def test_facts_of_hdf5_that_are_missing_are_named(tmp_path: Path, place: str) -> None:
+    with h5py.File(tmp_path / "v.h5", "w") as file:
+        file[place] = VALUES
+        file.create_group("s00")
+        file["Data/Image/1/Metadata/x" if "Data" in place else "c/_SIMPL_GEOMETRY/SPACING"] = np.ones(3)
+        if "ITK" in place:
+            file["ITKImage/0/Spacing"], file["ITKImage/0/Origin"] = np.ones(3), np.zeros(3)
+    refused(
+        DataError,
+        "(Directions|ORIGIN|resolutions|Metadata): no dataset",
+        read_dataset,
+        tmp_path / "v.h5",
+        ReadOptions(array=place),
+    )
+
+
+def test_netcdf_files_are_closed_in_turn(tmp_path: Path) -> None:
+    """The garbage collector closes them, in any thread."""
+    volume = read_volume(write_netcdf(tmp_path / "v.nc"), ReadOptions(stored=True))
+    volume.data[:]
+    with _TURN:
+        closer = threading.Thread(target=lambda volumes: (volumes.clear(), gc.collect()), args=[[volume]])
+        del volume
+        closer.start()
+        closer.join(0.5)
+        assert closer.is_alive()
+    closer.join()
+
+
+def test_numpy_numbers_of_components(tmp_path: Path) -> None:
+    np.save(tmp_path / "v.npy", np.stack([VALUES, VALUES + 1], -1))
+    volume = read_volume(str(tmp_path / "v.npy"), ReadOptions(component=np.int64(1)))
+    np.testing.assert_allclose(volume.data, VALUES + 1)
 
 
 @pytest.mark.parametrize("place", ["x", "scaling_factor"])

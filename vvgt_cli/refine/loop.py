@@ -36,7 +36,7 @@ def run(
     record = OptimizeRecord()
     state = begin(gaussians, cameras, options, free)
     checks = Checks(state, check, record, options.check_rule)
-    others = [*(weights or ()), *([] if free is None else [free])]
+    others = [*(() if weights is None else weights), *([] if free is None else [free])]
     keep, course = _checkpoint(options, gaussians, (cameras, images), check, others, state, checks)
     entered, half = time.perf_counter(), 0 if options.early is None else options.early // 2
     order = spread_views(cameras, options.seed)

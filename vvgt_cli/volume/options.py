@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+import operator
 import re
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, SupportsIndex
 
 import numpy as np
 
@@ -68,6 +69,8 @@ class ReadOptions:
             parse_dtype(self.dtype)
         if self.crop is not None:
             parse_crop(self.crop)
+        if isinstance(self.component, SupportsIndex):  # numpy's whole numbers too
+            object.__setattr__(self, "component", operator.index(self.component))
         dims, edges, part = self.dims, self.spacing, self.component
         positive = edges is None or (len(edges) == 3 and all(math.isfinite(s) and s > 0 for s in edges))
         for flag, value, good, expected in (

@@ -17,7 +17,7 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.headers import text_of
 from vvgt_cli.volume.labelled import AXIS_ATTRIBUTES, CF_ATTRIBUTES, Axis, axis, even_axis
-from vvgt_cli.volume.reading import Volume, unit_rows
+from vvgt_cli.volume.reading import Volume, printable, unit_rows
 
 _ITK = re.compile(r"/ITKImage/\d+")
 Held = Callable[[Any, str], Any]  # a group and a path in it to a dataset, None where there is none
@@ -64,9 +64,17 @@ def _even(names: Sequence[str], sizes: Sequence[int], first: Any, steps: Any, un
     return [even_axis(*one, stated) for one in zip(names, sizes, first, steps, strict=False)]
 
 
+def _stated(held: Held, group: Any, key: str) -> Any:
+    """Return a dataset that a convention needs; raise DataError where there is none."""
+    if (dataset := held(group, key)) is None:
+        where = printable(f"{group.name.rstrip('/')}/{key}")
+        raise DataError(f"{group.file.filename}:{where}: no dataset; check that the file is whole")
+    return dataset
+
+
 def _itk(group: Any, dataset: Any, held: Held) -> list[Axis]:
     """Return the axes of an image of ITK (HDF5ImageIO), whose facts are in the order x, y, z."""
-    steps, first = (np.ravel(held(group, key))[::-1] for key in ("Spacing", "Origin"))
+    steps, first = (np.ravel(_stated(held, group, key))[::-1] for key in ("Spacing", "Origin"))
     spatial = _even("tzyx"[-len(steps) :], dataset.shape, first, steps)
     return [*spatial, *(Axis("components", n, role="c") for n in dataset.shape[len(steps) :])]
 
@@ -75,7 +83,7 @@ def turned_by_itk(group: Any, volume: Volume, held: Held) -> Volume:
     """Return the volume in the anatomical space of ITK, if an image of it is in the group: an axis a row."""
     if not _ITK.fullmatch(group.name):
         return volume
-    axes, stated = np.eye(3), np.asarray(held(group, "Directions"), np.float64)[:3, :3]
+    axes, stated = np.eye(3), np.asarray(_stated(held, group, "Directions"), np.float64)[:3, :3]
     axes[: len(stated), : len(stated)] = stated
     return replace(volume, direction=unit_rows(axes)[1], space="LPS")
 
@@ -126,7 +134,7 @@ def _bigdataviewer(file: Any, setup: str, level: int, dataset: Any, held: Held) 
 
     Without the setup's attribute ``dataType``, int16 stands for uint16 (bigdataviewer-core, ``Hdf5ImageLoader``).
     """
-    factors = held(file, f"{setup}/resolutions")[level][::-1]
+    factors = _stated(held, file, f"{setup}/resolutions")[level][::-1]
     axes = _even("zyx", dataset.shape, (factors - 1) / 2, factors)
     unsigned = text_of(file[setup].attrs.get("dataType", "uint16")).startswith("uint")
     return axes, {"_Unsigned": "true"} if unsigned else {}
@@ -134,8 +142,8 @@ def _bigdataviewer(file: Any, setup: str, level: int, dataset: Any, held: Held) 
 
 def _velox(group: Any, dataset: Any, held: Held) -> list[Axis]:
     """Return the axes y, x and frames of an image of Velox; its metadata are JSON in bytes, a column a frame."""
-    stated = held(group, "Metadata")[:, 0].tobytes().partition(b"\0")[0] if "Metadata" in group else b"{}"
-    facts = json.loads(stated).get("BinaryResult", {})
+    stated = _stated(held, group, "Metadata")[:, 0].tobytes() if "Metadata" in group else b"{}"
+    facts = json.loads(stated.partition(b"\0")[0]).get("BinaryResult", {})
     axes = []
     for name, side, size in zip("yx", ("height", "width"), dataset.shape, strict=False):
         step = float(facts.get("PixelSize", {}).get(side) or 0)
@@ -155,7 +163,7 @@ def _nexus_scaling(group: Any, name: str, held: Held) -> dict[str, Any]:
 
 def _dream3d(above: Any, dataset: Any, held: Held) -> list[Axis]:
     """Return the axes of cells of DREAM.3D, whose origin is a corner; spacing and origin are in the order x, y, z."""
-    steps, first = (np.ravel(held(above, f"_SIMPL_GEOMETRY/{key}"))[::-1] for key in ("SPACING", "ORIGIN"))
+    steps, first = (np.ravel(_stated(held, above, f"_SIMPL_GEOMETRY/{key}"))[::-1] for key in ("SPACING", "ORIGIN"))
     spatial = _even("zyx", dataset.shape, first + steps / 2, steps)
     return [*spatial, *(Axis("components", n, None, "", "c") for n in dataset.shape[3:])]
 

@@ -8,6 +8,7 @@ are applied.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from vvgt_cli.volume.microscopy.imaris import is_imaris, read_imaris
 from vvgt_cli.volume.reading import ReadOptions, Volume, printable, text_of, volume_name
 
 MAX_VISITED = 100_000
+MAX_LINKS = 16  # that HDF5 follows
 MAX_BESIDE = 1000  # members of a group that are looked at for coordinates
 
 
@@ -47,23 +49,24 @@ def read_dataset(path: Path, options: ReadOptions) -> Volume:
     h5py = need("h5py", "hdf5", str(path), "HDF5")
     with h5py.File(path, "r") as file:
         dataset = _choose(h5py, file, options.array, path)
-        source = f"{path}:{printable(dataset.name)}"
-        check_storage(h5py, dataset, path, source)
-        mapped = _mapped(dataset, path)
+        source, place = f"{path}:{printable(dataset.name)}", Path(dataset.file.filename)  # a link's may lie beside
+        check_storage(h5py, dataset, source)
+        mapped = _mapped(dataset, place)
         stored = mapped if mapped is not None else lambda index: dataset[index]
         name = f"{volume_name(path)}:{dataset.name.strip('/')}"
         attributes = {key: dataset.attrs[key] for key in ATTRIBUTES if key in dataset.attrs}
         attributes |= {key: up.attrs[key] for up in (file, dataset.parent) for key in GEOMETRY if key in up.attrs}
-        axes, held = scaled_axes(dataset), partial(held_dataset, h5py, path)
+        read, held = partial(_coordinates, h5py, path), partial(held_dataset, h5py, path)
+        axes = scaled_axes(dataset, read)
         if not any(a.name or a.centres is not None for a in axes):
             axes, more = conventional_axes(file, dataset, source, held) or (axes, {})
             attributes |= more
         attributes |= flags_of(h5py.check_enum_dtype(dataset.dtype))
-        axes = with_neighbours(axes, _beside(h5py, dataset, path), source, options.spacing is not None)
+        axes = with_neighbours(axes, _beside(h5py, dataset, read), source, options.spacing is not None)
         _warn_of_xdmf(path, axes, options)
         chunks = dataset.chunks or dataset.shape
         if mapped is None and options.stored:
-            stored = partial(read_part, path, dataset.name)
+            stored = partial(read_part, place, dataset.name)
         volume = labelled_volume(stored, dataset.dtype, axes, attributes, options, source, name, chunks)
         return turned_by_itk(dataset.parent, volume, held)
 
@@ -85,19 +88,20 @@ def checked_dataset(h5py: Any, file: Any, path: Path, name: str) -> Any:
 
 def held_dataset(h5py: Any, path: Path, group: Any, name: str) -> Any:
     """Return a dataset in a group as `checked_dataset` does, None where there is none."""
-    _check_links(h5py, group, name, path)
+    _check_links(h5py, group, name)
     if not isinstance(dataset := group.get(name), h5py.Dataset):
         return None
-    check_storage(h5py, dataset, path, f"{path}:{printable(dataset.name)}")
+    check_storage(h5py, dataset, f"{path}:{printable(dataset.name)}")
     return dataset
 
 
 def _choose(h5py: Any, file: Any, wanted: str | None, path: Path) -> Any:
     if wanted is not None:
-        _check_links(h5py, file, wanted, path)
+        _check_links(h5py, file, wanted)
         item = file.get(wanted)
         if isinstance(item, h5py.Dataset):
-            return file[choose_grid({item.name: (item.shape or (), item.dtype.name)}, item.name, str(path))]
+            choose_grid({item.name: (item.shape or (), item.dtype.name)}, item.name, str(path))
+            return item
         file, wanted = (item, None) if isinstance(item, h5py.Group) else (file, wanted)
     known = {d.name: (d.shape, d.dtype.name) for d in datasets(h5py, file)}
     how = f"choose one as {path}:{printable(next(iter(known), '/path'))} (or with --array)"
@@ -124,13 +128,15 @@ def datasets(h5py: Any, group: Any) -> list[Any]:
     return [d for d in listed if d.name.rpartition("/")[2] not in described] or listed
 
 
-def _beside(h5py: Any, dataset: Any, path: Path) -> dict[str, Neighbour]:
+def _coordinates(h5py: Any, path: Path, item: Any) -> tuple[np.ndarray, dict[str, Any]]:
+    """Read coordinates and what describes them, if their values can be read."""
+    check_storage(h5py, item, f"{path}:{printable(item.name)}")
+    return coordinates_of(item)
+
+
+def _beside(h5py: Any, dataset: Any, read: Callable[[Any], Any]) -> dict[str, Neighbour]:
     """List the datasets in the group of another, and in groups of coordinates beside that or above."""
     here, neighbours = dataset.parent, {}
-
-    def read(item: Any) -> tuple[np.ndarray, dict[str, Any]]:
-        check_storage(h5py, item, path, f"{path}:{printable(item.name)}")
-        return coordinates_of(item)
 
     def visit(name: str, item: Any) -> bool | None:  # of no links, which may lead into other files
         group = item.parent
@@ -144,26 +150,36 @@ def _beside(h5py: Any, dataset: Any, path: Path) -> dict[str, Neighbour]:
     return neighbours
 
 
-def _check_links(h5py: Any, file: Any, wanted: str, path: Path) -> None:
-    """Refuse a path, from a file or a group, that leads into another file outside of this one's folder."""
+def _check_links(h5py: Any, file: Any, wanted: str, turns: Iterator[int] | None = None) -> None:
+    """Refuse a path, from a file or a group, that leads into a file outside of its folder, or over too many links."""
+    turns = turns or iter(range(MAX_LINKS))
     place = file.file if wanted.startswith("/") else file
-    for part in wanted.strip("/").split("/"):
+    for part in wanted.split("/"):
+        if part in ("", "."):
+            continue
         link = place.get(part, getlink=True) if isinstance(place, h5py.Group) else None
+        if isinstance(link, h5py.ExternalLink | h5py.SoftLink) and next(turns, None) is None:
+            raise DataError(f"{place.file.filename}:{printable(wanted)}: too many links; expected at most {MAX_LINKS}")
         if isinstance(link, h5py.ExternalLink):
-            data_file(path, link.filename, exact=True)
+            with h5py.File(data_file(Path(place.file.filename), link.filename, exact=True), "r") as beside:
+                _check_links(h5py, beside, link.path, turns)
         if isinstance(link, h5py.SoftLink):
-            _check_links(h5py, place, link.path, path)
+            _check_links(h5py, place, link.path, turns)
         place = place.get(part) if link is not None else None
 
 
-def check_storage(h5py: Any, dataset: Any, path: Path, source: str) -> None:
+def check_storage(h5py: Any, dataset: Any, source: str) -> None:
     """Refuse values in files outside of this one's folder, filters that are not there, and chunks beyond all bounds."""
     if dataset.external:
         raise DataError(f"{source}: its values lie in other files (external storage); try h5repack to bring them in")
     if dataset.is_virtual:
-        for part in dataset.virtual_sources():
-            if part.file_name != ".":
-                data_file(path, part.file_name, exact=True)
+        path = Path(dataset.file.filename)
+        for name, part in {(one.file_name, one.dset_name) for one in dataset.virtual_sources()}:
+            with h5py.File(path if name == "." else data_file(path, name, exact=True), "r") as beside:
+                _check_links(h5py, beside, part)
+                item = beside.get(part)
+                if not isinstance(item, h5py.Dataset) or item.external or item.is_virtual:
+                    raise DataError(f"{source}: {name}:{printable(part)}, its source, has no values of its own")
     if dataset.chunks and int(np.prod(dataset.chunks, dtype=object)) * dataset.dtype.itemsize > MAX_CHUNK:
         raise DataError(f"{source}: chunks of {dataset.chunks} values; expected at most {size_text(MAX_CHUNK)} each")
     plan = dataset.id.get_create_plist()
@@ -188,7 +204,7 @@ def _mapped(dataset: Any, path: Path) -> np.ndarray | None:
     return load_block(path, dataset.dtype, dataset.shape, offset=offset)
 
 
-def scaled_axes(dataset: Any) -> list[Axis]:
+def scaled_axes(dataset: Any, read: Callable[[Any], Any]) -> list[Axis]:
     """Return the axes of a dataset by its dimension scales, slowest first; without any they have no name."""
     axes = []
     for size, dimension in zip(dataset.shape, dataset.dims, strict=True):
@@ -198,7 +214,7 @@ def scaled_axes(dataset: Any) -> list[Axis]:
             axes.append(axis(dimension.label or (names[0] if names else ""), size))
             continue
         scale = scales[0]
-        axes.append(axis(scale.name.rpartition("/")[2], size, *(() if _is_bare(scale) else coordinates_of(scale))))
+        axes.append(axis(scale.name.rpartition("/")[2], size, *(() if _is_bare(scale) else read(scale))))
     return axes
 
 

@@ -10,11 +10,12 @@ from __future__ import annotations
 import math
 import mmap
 import os
+import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from threading import Lock
+from threading import RLock
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,9 @@ from vvgt_cli.volume.arrays.beside import Neighbour, choose_grid, warn_of_curvil
 from vvgt_cli.volume.labelled import DESCRIBES, axis, described_by, flags_of, labelled_volume
 from vvgt_cli.volume.reading import ReadOptions, Volume, load_block, need, volume_name
 
-_TURN = Lock()  # the library is not for several threads
+_TURN = RLock()  # the library is not for several threads; the garbage collector may close files during a turn
+if hasattr(os, "register_at_fork"):  # not on Windows; a child must not find a turn taken for ever
+    os.register_at_fork(before=_TURN.acquire, after_in_parent=_TURN.release, after_in_child=_TURN.release)
 
 
 def read_netcdf(path: Path, options: ReadOptions) -> Volume:
@@ -36,7 +39,7 @@ def read_netcdf(path: Path, options: ReadOptions) -> Volume:
     with open(path, "rb") as stream:
         if stream.read(3) == b"CDF":
             check_header(path)
-    with library.Dataset(str(path), "r") as file:
+    with _TURN, library.Dataset(str(path), "r") as file:
         file.set_auto_maskandscale(False)
         variable = _choose(file, options.array, path)
         attributes = {key: variable.getncattr(key) for key in variable.ncattrs()}
@@ -92,7 +95,12 @@ def _later(path: Path, where: str) -> Callable[[tuple[Any, ...]], np.ndarray]:
     def opened(process: int) -> Any:
         file = netCDF4.Dataset(str(path), "r")
         file.set_auto_maskandscale(False)
+        weakref.finalize(read, close, file)
         return file
+
+    def close(file: Any) -> None:
+        with _TURN:
+            file.close()
 
     def read(index: tuple[Any, ...]) -> np.ndarray:
         with _TURN:
