@@ -220,11 +220,22 @@ def test_hdf5_stays_in_its_folder(tmp_path: Path) -> None:
     with h5py.File(path.with_name("beside.h5"), "w") as file:
         file["before"], file["field"], file["far"] = VALUES[0], VALUES, h5py.ExternalLink("../outside.h5", "/field")
         file.create_virtual_dataset("virtual", layout)
-    told = {"raw": "other files", "a": "too many links", "nested": "no values of its own"}
-    for name in ("link", "soft", "virtual", "raw", "far", "near", ".//link", "a", "nested"):
+        near = h5py.VirtualLayout((3, 4, 5), "f8")
+        near[:] = h5py.VirtualSource(".", "field", (3, 4, 5))
+        file.create_virtual_dataset("inner", near)
+    with h5py.File(path, "a") as file:
+        twice = h5py.VirtualLayout((3, 4, 5), "f8")
+        twice[:] = h5py.VirtualSource("beside.h5", "inner", (3, 4, 5))
+        file.create_virtual_dataset("twice", twice)
+        own = h5py.VirtualLayout((3, 4, 5), "f8")
+        own[:] = h5py.VirtualSource("v.h5", "own", (3, 4, 5))
+        file.create_virtual_dataset("own", own)
+    told = {"raw": "other files", "a": "too many links", "own": "no values"}
+    for name in ("link", "soft", "virtual", "raw", "far", "near", ".//link", "a", "nested", "own"):
         refused(DataError, told.get(name, "own folder"), read_volume, f"{path}:/{name}")
     for stored in (False, True):
-        np.testing.assert_array_equal(read_volume(f"{path}:/other", ReadOptions(stored=stored)).data[:], VALUES)
+        for name in ("other", "twice"):
+            np.testing.assert_array_equal(read_volume(f"{path}:/{name}", ReadOptions(stored=stored)).data[:], VALUES)
 
 
 def test_scales_of_hdf5_stay_in_its_folder(tmp_path: Path) -> None:

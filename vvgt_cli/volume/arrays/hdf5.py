@@ -168,8 +168,11 @@ def _check_links(h5py: Any, file: Any, wanted: str, turns: Iterator[int] | None 
         place = place.get(part) if link is not None else None
 
 
-def check_storage(h5py: Any, dataset: Any, source: str) -> None:
-    """Refuse values in files outside of this one's folder, filters that are not there, and chunks beyond all bounds."""
+def check_storage(h5py: Any, dataset: Any, source: str, depth: int = MAX_LINKS) -> None:
+    """Refuse values in files outside of this one's folder, filters that are not there, and chunks beyond all bounds.
+
+    Sources of virtual datasets, which may be virtual themselves to a ``depth``, are held to the same.
+    """
     if dataset.external:
         raise DataError(f"{source}: its values lie in other files (external storage); try h5repack to bring them in")
     if dataset.is_virtual:
@@ -178,8 +181,9 @@ def check_storage(h5py: Any, dataset: Any, source: str) -> None:
             with h5py.File(path if name == "." else data_file(path, name, exact=True), "r") as beside:
                 _check_links(h5py, beside, part)
                 item = beside.get(part)
-                if not isinstance(item, h5py.Dataset) or item.external or item.is_virtual:
-                    raise DataError(f"{source}: {name}:{printable(part)}, its source, has no values of its own")
+                if not isinstance(item, h5py.Dataset) or not depth:
+                    raise DataError(f"{source}: {name}:{printable(part)}, its source, has no values")
+                check_storage(h5py, item, source, depth - 1)
     if dataset.chunks and int(np.prod(dataset.chunks, dtype=object)) * dataset.dtype.itemsize > MAX_CHUNK:
         raise DataError(f"{source}: chunks of {dataset.chunks} values; expected at most {size_text(MAX_CHUNK)} each")
     plan = dataset.id.get_create_plist()
