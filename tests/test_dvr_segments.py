@@ -50,10 +50,10 @@ def test_a_linear_field_is_placed_exactly_and_added() -> None:
     matrix = np.array([[0.0, 0.5, 0.2, 5.0], [0.7, 0.0, 0.1, 3.0], [0.1, 0.3, 0.0, 0.5]])
     dims, none = np.array([7, 6, 5]), np.zeros(3, np.int64)
     out = np.full((3, 4, 4, 2), 10.0)
-    place(values, matrix, none, none, dims, 100.0, out)
+    place(values, matrix, none, none, dims, np.zeros(3), 100.0, out)
     lo, first = np.array([1, 2, 1]), np.array([4, 0, 0])  # a part of the target from a part of the layer
     part = np.full((2, 2, 3, 2), 10.0)
-    place(np.ascontiguousarray(values[:, :, 4:]), matrix, lo, first, dims, 100.0, part)
+    place(np.ascontiguousarray(values[:, :, 4:]), matrix, lo, first, dims, np.zeros(3), 100.0, part)
     np.testing.assert_array_equal(part, out[1:3, 2:4, 1:4])
     k, j, i = np.indices(out.shape[:3])
     x, y, z = np.einsum("rc,ckji->rkji", matrix, np.stack([i, j, k, np.ones_like(i)]))

@@ -31,7 +31,8 @@ def place(
                 y = matrix[1, 0] * u + matrix[1, 1] * v + matrix[1, 2] * w + matrix[1, 3]
                 z = matrix[2, 0] * u + matrix[2, 1] * v + matrix[2, 2] * w + matrix[2, 3]
                 x_rim, y_rim, z_rim = 0.5 + rim[0], 0.5 + rim[1], 0.5 + rim[2]
-                if not (-x_rim <= x < nx - 1 + x_rim and -y_rim <= y < ny - 1 + y_rim and -z_rim <= z < nz - 1 + z_rim):
+                inside = -x_rim <= x <= nx - 1 + x_rim and -y_rim <= y <= ny - 1 + y_rim
+                if not (inside and -z_rim <= z <= nz - 1 + z_rim):
                     for c in range(channels):
                         out[k, j, i, c] += outside
                     continue

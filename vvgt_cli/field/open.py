@@ -173,6 +173,8 @@ def opened(
         DataError, UsageError: see `vvgt_cli.field.source.load`.
         MissingBlocks: other shards' blocks are missing.
     """
+    from vvgt_cli.field.reader import Layers
+
     options = options or automatic(request, run.console)
     if options is None:
         with run.stage("read") as stage:
@@ -187,6 +189,8 @@ def opened(
         return
     with store or store_beside(None) as blocks, blocked(run, request, options, blocks, needs) as in_blocks:
         in_blocks.source = look(in_blocks.source)
+        if isinstance(in_blocks.reader, Layers):  # under the light that the look has
+            in_blocks.reader = replace(in_blocks.reader, smooth=in_blocks.source.smooth)
         run.compile(for_blocks(kernels(in_blocks.source, True)), in_blocks.source.kernel_type())
         yield in_blocks
 
@@ -249,7 +253,6 @@ def _absolute(path: str) -> str:
 def _reader(source: StyledVolume, access: BlockAccess) -> tuple[Reader, float]:
     """Return the reader of a source's boxes, and its approximate number of visible voxels."""
     from vvgt_cli.closed_form.samples import estimate, visible_share
-    from vvgt_cli.dvr.layers import smooth_labels
     from vvgt_cli.dvr.scene import kernel_rule
     from vvgt_cli.field.reader import Layers, Scalars
     from vvgt_cli.look.tables import Optics, build_tables
@@ -271,8 +274,7 @@ def _reader(source: StyledVolume, access: BlockAccess) -> tuple[Reader, float]:
     grid = replace(volume, data=np.zeros((1, 1, 1), np.uint8))
     places = tuple(tuple(map(access.place, (layer.volume, *(layer.colors or ())))) for layer in source.layers)
     layers = tuple(replace(layer, volume=grid, colors=None) for layer in source.layers)
-    smooth = source.lighting is not None and smooth_labels(source.layers)
-    reader = Layers(layers, places, grid, volume.dims, frame.scale, Optics.linear(top), smooth)
+    reader = Layers(layers, places, grid, volume.dims, frame.scale, Optics.linear(top), source.smooth)
     return reader, reader.visible()
 
 

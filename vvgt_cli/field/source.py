@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-from vvgt_cli.dvr.layers import Layer, common_grid, grid_of
+from vvgt_cli.dvr.layers import Layer, common_grid, grid_of, smooth_labels
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError
 from vvgt_cli.field.digests import digest, volume_digest
 from vvgt_cli.field.layered import Access, OpenedFile, content_of, layers_of, told_apart
@@ -183,6 +183,11 @@ class StyledVolume:
     def mixed(self) -> bool:
         """Whether rays classify layers of scalars before they add them up."""
         return self.gridded and any(layer.interpolated for layer in self.layers)
+
+    @property
+    def smooth(self) -> bool:
+        """Whether labels have smoothed normals: under light, with layers of scalars beside them at most."""
+        return self.lighting is not None and smooth_labels(self.layers)
 
     @property
     def labels_alone(self) -> bool:
