@@ -4,8 +4,38 @@ from __future__ import annotations
 
 import numpy as np
 
+from vvgt_cli.dvr.layout import Mixture, Voxels
+
 REACH = 1  # voxels on either side that count
 SLAB = 8  # slices that are filtered at once
+
+
+class Shaded:
+    """What rays shade: the values of a scene or of a box of voxels, and what their normals are taken from."""
+
+    values: np.ndarray
+    mixture: Mixture | None
+    relief: np.ndarray | None
+
+    @property
+    def voxels(self) -> Voxels:
+        """`values` as kernels take them."""
+        return Voxels(self.values)
+
+    @property
+    def mixed(self) -> bool:
+        """Whether rays meet layers of scalars."""
+        return self.mixture is not None and self.mixture.scalars is not None
+
+    @property
+    def relieved(self) -> Voxels:
+        """What the normals of texels are taken from: `relief`, or else `values`."""
+        return Voxels(self.values if self.relief is None else self.relief)
+
+    @property
+    def shaded(self) -> Voxels:
+        """What the normals of all matter are taken from: `relieved`, or `values` where there are scalars, too."""
+        return self.voxels if self.mixed else self.relieved
 
 
 def smoothed(extinction: np.ndarray) -> np.ndarray:

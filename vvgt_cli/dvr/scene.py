@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vvgt_cli.dvr.layers import Layer, mixture_box, scalar_tables, smooth_labels
-from vvgt_cli.dvr.layout import Light, Mixture, Texels, Voxels, pairs_fit
+from vvgt_cli.dvr.layout import Light, Mixture, Texels, pairs_fit
 from vvgt_cli.dvr.light import scene_light
-from vvgt_cli.dvr.relief import smoothed
+from vvgt_cli.dvr.relief import Shaded, smoothed
 from vvgt_cli.look import Lighting, Named, TransferFunction
 from vvgt_cli.look.tables import Optics, build_tables
 from vvgt_cli.volume import Volume
@@ -44,7 +44,7 @@ class PreparedVolume:
 
 
 @dataclass(frozen=True)
-class Scene:
+class Scene(Shaded):
     """Volume under a transfer function, as every later stage reads it.
 
     Attributes:
@@ -88,26 +88,6 @@ class Scene:
         """`grid` as kernels take it."""
         assert self.grid is not None
         return Texels(self.grid)
-
-    @property
-    def voxels(self) -> Voxels:
-        """`values` as kernels take them."""
-        return Voxels(self.values)
-
-    @property
-    def relieved(self) -> Voxels:
-        """What the normals of texels are taken from, as kernels take it: `relief`, or else `values`."""
-        return Voxels(self.values if self.relief is None else self.relief)
-
-    @property
-    def shaded(self) -> Voxels:
-        """What the normals of all matter are taken from: `relieved`, or `values` where there are scalars, too."""
-        return self.voxels if self.mixed else self.relieved
-
-    @property
-    def mixed(self) -> bool:
-        """Whether rays meet layers of scalars."""
-        return self.mixture is not None and self.mixture.scalars is not None
 
     @classmethod
     def build(
@@ -164,9 +144,10 @@ class Scene:
         optics, tables = Optics.linear(float(values.max())), scalar_tables(layers, per_unit, float(np.mean(frame.step)))
         mixture = mixture_box(layers, tables, volume, np.zeros(3, np.int64), np.array(volume.dims), grid, per_unit)
         empty = bricks.empty_bricks(values, optics, mixture)
-        smooth = labels or smooth_labels(layers)
-        about = None, None, grid, mixture, labels, smooth
-        scene = cls(volume, tf, unit_distance, values, optics, empty, half, step, *about)
+        scene = cls(
+            volume, tf, unit_distance, values, optics, empty, half, step, grid=grid, mixture=mixture, labels=labels,
+            smooth=labels or smooth_labels(layers),
+        )  # fmt: skip
         return scene if lighting is None else scene.lit(lighting)
 
     def lit(self, lighting: Lighting) -> Scene:

@@ -10,8 +10,8 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from vvgt_cli.dvr.layers import Layer, grid_box, mixture_box, scalar_tables
-from vvgt_cli.dvr.layout import Mixture, Texels, Voxels
-from vvgt_cli.dvr.relief import REACH, smoothed
+from vvgt_cli.dvr.layout import Mixture, Texels
+from vvgt_cli.dvr.relief import REACH, Shaded, smoothed
 from vvgt_cli.dvr.scene import KernelRule, read_only
 from vvgt_cli.field.layered import OpenedFile, content_of, open_content
 from vvgt_cli.look.tables import Optics
@@ -53,7 +53,7 @@ def forget() -> None:
 
 
 @dataclass(frozen=True)
-class VoxelBox:
+class VoxelBox(Shaded):
     """A box of voxels in the layout of the kernels.
 
     Attributes:
@@ -71,26 +71,6 @@ class VoxelBox:
     begin: np.ndarray
     mixture: Mixture | None = None
     relief: np.ndarray | None = None
-
-    @property
-    def voxels(self) -> Voxels:
-        """`values` in the kernels' type."""
-        return Voxels(self.values)
-
-    @property
-    def relieved(self) -> Voxels:
-        """`Scene.relieved` of the box."""
-        return Voxels(self.values if self.relief is None else self.relief)
-
-    @property
-    def shaded(self) -> Voxels:
-        """`Scene.shaded` of the box."""
-        return self.voxels if self.mixed else self.relieved
-
-    @property
-    def mixed(self) -> bool:
-        """Whether rays meet layers of scalars."""
-        return self.mixture is not None and self.mixture.scalars is not None
 
     @property
     def texels(self) -> Texels | None:
