@@ -17,10 +17,10 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.headers import text_of
 from vvgt_cli.volume.labelled import AXIS_ATTRIBUTES, CF_ATTRIBUTES, Axis, axis, even_axis
-from vvgt_cli.volume.reading import Volume, printable, unit_rows
+from vvgt_cli.volume.reading import Volume, unit_rows
 
 _ITK = re.compile(r"/ITKImage/\d+")
-Held = Callable[[Any, str], Any]  # a group and a path in it to a dataset, None where there is none
+Held = Callable[..., Any]  # `hdf5.checked_dataset` of a group and a path in it
 
 
 def coordinates_of(dataset: Any) -> tuple[np.ndarray, dict[str, Any]]:
@@ -64,17 +64,9 @@ def _even(names: Sequence[str], sizes: Sequence[int], first: Any, steps: Any, un
     return [even_axis(*one, stated) for one in zip(names, sizes, first, steps, strict=False)]
 
 
-def _stated(held: Held, group: Any, key: str) -> Any:
-    """Return a dataset that a convention needs; raise DataError where there is none."""
-    if (dataset := held(group, key)) is None:
-        where = printable(f"{group.name.rstrip('/')}/{key}")
-        raise DataError(f"{group.file.filename}:{where}: no dataset; check that the file is whole")
-    return dataset
-
-
 def _itk(group: Any, dataset: Any, held: Held) -> list[Axis]:
     """Return the axes of an image of ITK (HDF5ImageIO), whose facts are in the order x, y, z."""
-    steps, first = (np.ravel(_stated(held, group, key))[::-1] for key in ("Spacing", "Origin"))
+    steps, first = (np.ravel(held(group, key))[::-1] for key in ("Spacing", "Origin"))
     spatial = _even("tzyx"[-len(steps) :], dataset.shape, first, steps)
     return [*spatial, *(Axis("components", n, role="c") for n in dataset.shape[len(steps) :])]
 
@@ -83,7 +75,7 @@ def turned_by_itk(group: Any, volume: Volume, held: Held) -> Volume:
     """Return the volume in the anatomical space of ITK, if an image of it is in the group: an axis a row."""
     if not _ITK.fullmatch(group.name):
         return volume
-    axes, stated = np.eye(3), np.asarray(_stated(held, group, "Directions"), np.float64)[:3, :3]
+    axes, stated = np.eye(3), np.asarray(held(group, "Directions"), np.float64)[:3, :3]
     axes[: len(stated), : len(stated)] = stated
     return replace(volume, direction=unit_rows(axes)[1], space="LPS")
 
@@ -121,7 +113,7 @@ def _nexus(group: Any, dataset: Any, held: Held) -> list[Axis]:
         return []
     axes = []
     for name, size in zip(names, dataset.shape, strict=True):
-        beside = None if name == "." else held(group, name)
+        beside = None if name == "." else held(group, name, needed=False)
         if beside is None or beside.shape != (size,) or beside.dtype.kind not in "iuf":
             axes.append(axis("" if name == "." else name, size))
             continue
@@ -134,7 +126,7 @@ def _bigdataviewer(file: Any, setup: str, level: int, dataset: Any, held: Held) 
 
     Without the setup's attribute ``dataType``, int16 stands for uint16 (bigdataviewer-core, ``Hdf5ImageLoader``).
     """
-    factors = _stated(held, file, f"{setup}/resolutions")[level][::-1]
+    factors = held(file, f"{setup}/resolutions")[level][::-1]
     axes = _even("zyx", dataset.shape, (factors - 1) / 2, factors)
     unsigned = text_of(file[setup].attrs.get("dataType", "uint16")).startswith("uint")
     return axes, {"_Unsigned": "true"} if unsigned else {}
@@ -142,7 +134,7 @@ def _bigdataviewer(file: Any, setup: str, level: int, dataset: Any, held: Held) 
 
 def _velox(group: Any, dataset: Any, held: Held) -> list[Axis]:
     """Return the axes y, x and frames of an image of Velox; its metadata are JSON in bytes, a column a frame."""
-    stated = _stated(held, group, "Metadata")[:, 0].tobytes() if "Metadata" in group else b"{}"
+    stated = held(group, "Metadata")[:, 0].tobytes() if "Metadata" in group else b"{}"
     facts = json.loads(stated.partition(b"\0")[0]).get("BinaryResult", {})
     axes = []
     for name, side, size in zip("yx", ("height", "width"), dataset.shape, strict=False):
@@ -155,7 +147,7 @@ def _velox(group: Any, dataset: Any, held: Held) -> list[Axis]:
 def _nexus_scaling(group: Any, name: str, held: Held) -> dict[str, Any]:
     """Return the scaling of an NXdata field, ``(value + offset) * scaling_factor``, as CF has it."""
     factor, offset = (
-        float(np.ravel(next((one for k in (f"{name}_{key}", key) if (one := held(group, k)) is not None), plain))[0])
+        next((float(np.ravel(one)[0]) for k in (f"{name}_{key}", key) if (one := held(group, k, needed=False))), plain)
         for key, plain in (("scaling_factor", 1.0), ("offset", 0.0))
     )
     return {"scale_factor": factor, "add_offset": offset * factor} if (factor, offset) != (1, 0) else {}
@@ -163,7 +155,7 @@ def _nexus_scaling(group: Any, name: str, held: Held) -> dict[str, Any]:
 
 def _dream3d(above: Any, dataset: Any, held: Held) -> list[Axis]:
     """Return the axes of cells of DREAM.3D, whose origin is a corner; spacing and origin are in the order x, y, z."""
-    steps, first = (np.ravel(_stated(held, above, f"_SIMPL_GEOMETRY/{key}"))[::-1] for key in ("SPACING", "ORIGIN"))
+    steps, first = (np.ravel(held(above, f"_SIMPL_GEOMETRY/{key}"))[::-1] for key in ("SPACING", "ORIGIN"))
     spatial = _even("zyx", dataset.shape, first + steps / 2, steps)
     return [*spatial, *(Axis("components", n, None, "", "c") for n in dataset.shape[3:])]
 

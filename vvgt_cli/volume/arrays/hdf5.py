@@ -36,7 +36,7 @@ def read_hdf5(path: Path, options: ReadOptions) -> Volume:
     h5py = need("h5py", "hdf5", str(path), "HDF5")
     with h5py.File(path, "r") as file:
         if is_imaris(file):
-            return read_imaris(file, path, options, partial(checked_dataset, h5py, file, path))
+            return read_imaris(file, path, options, partial(checked_dataset, h5py, path, file))
     if (volume := bigdataviewer.read_beside(path, options)) is not None:
         return volume
     if options.level is not None:
@@ -56,7 +56,7 @@ def read_dataset(path: Path, options: ReadOptions) -> Volume:
         name = f"{volume_name(path)}:{dataset.name.strip('/')}"
         attributes = {key: dataset.attrs[key] for key in ATTRIBUTES if key in dataset.attrs}
         attributes |= {key: up.attrs[key] for up in (file, dataset.parent) for key in GEOMETRY if key in up.attrs}
-        read, held = partial(_coordinates, h5py, path), partial(held_dataset, h5py, path)
+        read, held = partial(_coordinates, h5py, path), partial(checked_dataset, h5py, path)
         axes = scaled_axes(dataset, read)
         if not any(a.name or a.centres is not None for a in axes):
             axes, more = conventional_axes(file, dataset, source, held) or (axes, {})
@@ -79,20 +79,19 @@ def _warn_of_xdmf(path: Path, axes: list[Axis], options: ReadOptions) -> None:
         warnings.warn(f"{path}: states no spacing, which is taken as 1; {beside[0]} may: give that file", stacklevel=3)
 
 
-def checked_dataset(h5py: Any, file: Any, path: Path, name: str) -> Any:
-    """Return a dataset whose values can be read, by a path that leads into no file elsewhere."""
-    if (dataset := held_dataset(h5py, path, file, name)) is None:
-        raise DataError(f"{path}:/{name}: no dataset; check that the file is whole")
-    return dataset
+def checked_dataset(h5py: Any, path: Path, group: Any, name: str, needed: bool = True) -> Any:
+    """Return a dataset in a group whose values can be read, by a path that leads into no file elsewhere.
 
-
-def held_dataset(h5py: Any, path: Path, group: Any, name: str) -> Any:
-    """Return a dataset in a group as `checked_dataset` does, None where there is none."""
+    Return None where there is none and it is not ``needed``.
+    """
     _check_links(h5py, group, name)
-    if not isinstance(dataset := group.get(name), h5py.Dataset):
-        return None
-    check_storage(h5py, dataset, f"{path}:{printable(dataset.name)}")
-    return dataset
+    if isinstance(dataset := group.get(name), h5py.Dataset):
+        check_storage(h5py, dataset, f"{path}:{printable(dataset.name)}")
+        return dataset
+    if needed:
+        place = printable(f"{group.name.rstrip('/')}/{name}")
+        raise DataError(f"{path}:{place}: no dataset; check that the file is whole")
+    return None
 
 
 def _choose(h5py: Any, file: Any, wanted: str | None, path: Path) -> Any:

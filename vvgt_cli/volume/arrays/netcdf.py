@@ -60,7 +60,9 @@ def read_netcdf(path: Path, options: ReadOptions) -> Volume:
         where = f"{variable.group().path.rstrip('/')}/{variable.name}"
         by_box = options.stored and options.dims is None and options.component != "magnitude"
         read = _later(path, where) if by_box else lambda index: variable[index]
-        chunks = _chunks(variable) if by_box else None
+        chunks = variable.chunking() if by_box else None
+        if by_box and not isinstance(chunks, list):  # of plain values: a slice
+            chunks = [1] * (variable.ndim - 2) + list(variable.shape[-2:])
         return labelled_volume(read, np.dtype(variable.dtype), axes, attributes, options, source, name, chunks)
 
 
@@ -107,14 +109,6 @@ def _later(path: Path, where: str) -> Callable[[tuple[Any, ...]], np.ndarray]:
             return np.asarray(opened(os.getpid())[where][index])
 
     return read
-
-
-def _chunks(variable: Any) -> list[int]:
-    """Return the values along each axis that the file packs together; a slice of plain values."""
-    sizes = variable.chunking()
-    if isinstance(sizes, list | tuple):
-        return [int(n) for n in sizes]
-    return [1] * (len(variable.shape) - 2) + list(variable.shape[-2:])
 
 
 def _choose(file: Any, wanted: str | None, path: Path) -> Any:

@@ -14,7 +14,7 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.headers import MAX_HEADER, HeaderFields
 from vvgt_cli.volume.reading import ReadOptions, Volume, data_file, load_block, select_component, volume_name
-from vvgt_cli.volume.space import MILLIMETRE, metres, one_unit, unit_rows
+from vvgt_cli.volume.space import MILLIMETRE, metres, one_unit, placed
 
 _SCALING = (("slope", 1), ("offset", 0))
 
@@ -55,7 +55,7 @@ def _first(fields: HeaderFields, keys: tuple[str, ...], n: int, default: float) 
 
 
 def _place(fields: HeaderFields, n: int, options: ReadOptions) -> dict[str, Any]:
-    """Return spacing, direction, origin, space and unit, as keywords of `Volume`.
+    """Return the arguments ``steps``, ``origin``, ``space`` and ``unit`` of `placed`.
 
     TransformMatrix lists the axes one after the other. The space is LPS, in mm, where the header names an orientation
     or gives axes, as ITK has it whatever the letters are.
@@ -75,9 +75,7 @@ def _place(fields: HeaderFields, n: int, options: ReadOptions) -> dict[str, Any]
     factor = 1.0
     if space is not None:
         factor, unit = (metres(unit) or MILLIMETRE) / MILLIMETRE, ""
-    lengths, direction = unit_rows(rows * np.where(spacing < 0, -1.0, 1.0)[:, None])
-    edges, first = options.spacing_or(tuple(factor * spacing * lengths)), tuple((factor * origin).tolist())
-    return {"spacing": edges, "direction": direction, "origin": first, "space": space, "unit": unit}
+    return {"steps": factor * spacing[:, None] * rows, "origin": factor * origin, "space": space, "unit": unit}
 
 
 def read_metaimage(path: Path, options: ReadOptions) -> Volume:
@@ -108,7 +106,7 @@ def read_metaimage(path: Path, options: ReadOptions) -> Volume:
     field, _ = select_component(block, options.component, str(path))
     if any(fields.get(f"elementtointensityfunction{key}", f"{n}") not in (f"{n}", f"{n}.0") for key, n in _SCALING):
         warnings.warn(f"{path}: ElementToIntensityFunction is not applied to its values, as in ITK", stacklevel=2)
-    return Volume(field, name=volume_name(path), **_place(fields, len(sizes), options))
+    return placed(field, options=options, name=volume_name(path), **_place(fields, len(sizes), options))
 
 
 def _load(fields: HeaderFields, source: Path, dtype: np.dtype, shape: tuple[int, ...], start: int) -> np.ndarray:

@@ -90,12 +90,12 @@ def _minc1(path: Path) -> _Image:
 def _minc2(path: Path) -> _Image:
     h5py = need("h5py", "hdf5", str(path), "MINC 2")
     with h5py.File(path, "r") as file:
-        data = checked_dataset(h5py, file, path, IMAGE + "image")
+        data = checked_dataset(h5py, path, file, IMAGE + "image")
         names = _order(data)
         limits = []
         for name in ("image-min", "image-max"):
             if IMAGE + name in file:
-                one = checked_dataset(h5py, file, path, IMAGE + name)
+                one = checked_dataset(h5py, path, file, IMAGE + name)
                 check_memory(one.size * one.dtype.itemsize, path.name)
                 limits.append((_order(one), np.asarray(one[()])))
         axes = {name: dict(file[DIMENSIONS + name].attrs) for name in names if DIMENSIONS + name in file}

@@ -27,9 +27,9 @@ from xml.etree import ElementTree
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.volume.microscopy.image import Micrograph, choose_image, picture_volume
-from vvgt_cli.volume.reading import ReadOptions, Slices, Volume, metres, printable, size_text, triple, volume_name
-from vvgt_cli.volume.space import MICROMETRE
+from vvgt_cli.volume.microscopy.image import Micrograph, choose_image, hex_color, picture_volume
+from vvgt_cli.volume.reading import ReadOptions, Slices, Volume, load_block, printable, size_text, triple, volume_name
+from vvgt_cli.volume.space import MICROMETRE, metres
 from vvgt_cli.volume.tiff.decode import Pages
 from vvgt_cli.volume.tiff.ome import ome_tag, open_tiff
 from vvgt_cli.volume.tiff.pages import check_pages
@@ -102,7 +102,9 @@ def read_tiff(path: Path, options: ReadOptions, slices: int = 1) -> Volume:
         series, number = _series(file, options.array, path)
         facts = _facts(file, root, series, number, path)
         layout = _layout(series, path)
-        mapped = _mapped(file, series, layout, path) if _mappable(series) else None
+        mapped = None
+        if _mappable(series):
+            mapped = load_block(path, series.dtype.newbyteorder(file.byteorder), layout.shape, offset=series.dataoffset)
         stored = options.stored and options.component != "magnitude" and (mapped is not None or layout.paged)
         again = partial(_opened, path, number) if stored else lambda: (series, pages)
         sizes = triple(map(layout.count, "ZYX"))
@@ -243,15 +245,6 @@ def _described(axes: str, shape: tuple[int, ...]) -> str:
     return ", ".join(f"{n} {_AXES.get(a, a)}" for a, n in zip(axes, shape, strict=True) if n > 1) or "of one value each"
 
 
-def _mapped(file: Any, series: Any, layout: SeriesAxes, path: Path) -> np.ndarray:
-    """Map the values of a series that lie together plainly."""
-    offset, need = int(series.dataoffset), math.prod(layout.shape) * series.dtype.itemsize
-    size = path.stat().st_size
-    if offset + need > size:
-        raise DataError(f"{path}: {size_text(offset + need - size)} of its pixels are missing; is it whole?")
-    return np.memmap(path, series.dtype.newbyteorder(file.byteorder), "r", offset, layout.shape)
-
-
 def _mappable(series: Any) -> bool:
     """Return whether the values of a series lie together plainly; those of one directory may begin anywhere."""
     aligned = bool(series.keyframe.is_memmappable) or bool(series.is_truncated)
@@ -339,11 +332,8 @@ def ome_facts(root: ElementTree.Element, series: int, name: str, count: int, pat
 
 def _color(text: str | None) -> tuple[float, float, float] | None:
     """Convert OME's signed 32-bit RGBA to RGB; None for none, and for black, which shows nothing."""
-    if text is None or not re.fullmatch(r"-?\d{1,10}", text):
-        return None
-    value = int(text) & 0xFFFFFFFF
-    red, green, blue = value >> 24, value >> 16 & 255, value >> 8 & 255
-    return (red / 255, green / 255, blue / 255) if red + green + blue else None
+    number = re.fullmatch(r"-?\d{1,10}", text or "")
+    return hex_color(f"{(int(number[0]) & 0xFFFFFFFF) >> 8:06x}") if number else None
 
 
 def imagej_facts(stated: dict[str, Any], resolution: tuple[float | None, float | None], tag: int) -> Facts:

@@ -49,7 +49,7 @@ def _image(h5py: Any, file: Any, path: Path, options: ReadOptions) -> Volume:
     info = infos[choose_array(infos, options.array, source)]
     grid = image_grid(image, info.where, path)
     name = f"VTKHDF/{GROUPS[info.where]}/{info.name}"
-    dataset = checked_dataset(h5py, file, path, name)
+    dataset = checked_dataset(h5py, path, file, name)
     before = () if time is None else (_offset(h5py, file, path, info, time),)
     shape = tuple(reversed(grid.dims))
     expected = (*shape, *dataset.shape[len(before) + 3 :])
@@ -71,14 +71,14 @@ def _times(h5py: Any, file: Any, path: Path) -> list[float]:
     """Return the times of the steps; none where there are none."""
     if "VTKHDF/Steps" not in file:
         return []
-    values = checked_dataset(h5py, file, path, "VTKHDF/Steps/Values")
+    values = checked_dataset(h5py, path, file, "VTKHDF/Steps/Values")
     return [float(value) for value in np.ravel(values[()])]
 
 
 def _offset(h5py: Any, file: Any, path: Path, info: ArrayInfo, time: int) -> int:
     """Return where a step of an array begins, along its first axis."""
     name = f"VTKHDF/Steps/{GROUPS[info.where]}Offsets/{info.name}"
-    return int(checked_dataset(h5py, file, path, name)[time]) if name in file else time
+    return int(checked_dataset(h5py, path, file, name)[time]) if name in file else time
 
 
 def _arrays(h5py: Any, root: Any, timed: bool) -> list[ArrayInfo]:
