@@ -65,8 +65,7 @@ def _is_dicom_file(path: Source) -> bool:
 
 def holds_dicom(folder: Path) -> bool:
     """Tell whether there is a DICOM file among the first `TRIED` of a folder and the folders in it."""
-    every = (Path(root, name) for root, _, names in os.walk(folder) for name in names)
-    return any(map(_is_dicom_file, islice(every, TRIED)))
+    return any(map(_is_dicom_file, islice(_every(folder), TRIED)))
 
 
 def _every(path: Path) -> Iterator[Source]:

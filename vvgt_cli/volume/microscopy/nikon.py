@@ -49,13 +49,12 @@ def read_nd2(path: Path, options: ReadOptions) -> Volume:
         stack = next((one.parameters for one in file.experiment if one.type == "ZStackLoop"), None)
         if z and stack and (stack.stepUm < 0) == stack.bottomToTop:
             z = -z
-        several = sizes.get("C", 1) > 1
+        times, channels, samples, nz, ny, nx = (sizes.get(axis, 1) for axis in "TCSZYX")
         read = _reader(path, sizes, loops, place, np.dtype(file.dtype), packed)
         picture = Micrograph(
-            sizes.get("T", 1), sizes.get("C", 1) * sizes.get("S", 1), (sizes.get("Z", 1), sizes["Y"], sizes["X"]),
-            np.dtype(file.dtype), read, (1, sizes["Y"], sizes["X"]),
-            (x, y, z if sizes.get("Z", 1) > 1 else None), names=names if sizes.get("S", 1) == 1 else (), colors=colors,
-            rgb=sizes.get("S", 1) > 1 and not several,
+            times, channels * samples, (nz, ny, nx), np.dtype(file.dtype), read, (1, ny, nx),
+            (x, y, z if nz > 1 else None), names=names if samples == 1 else (), colors=colors,
+            rgb=samples > 1 and channels == 1,
         )  # fmt: skip
         name = volume_name(path) + (f":{place}" if sizes.get("P", 1) > 1 else "")
         return picture_volume(picture, options, str(path), name)
@@ -121,6 +120,7 @@ def _reader(
     ``packed`` holds the positions of compressed frames and the bytes of an unpacked one.
     """
     turn = Lock()  # one file, one reader: workers may have threads
+    channels, samples, ny, nx = (sizes.get(axis, 1) for axis in "CSYX")
 
     @cache
     def opened() -> Any:
@@ -136,10 +136,8 @@ def _reader(
             _, title, length = CHUNK.unpack(file.read(CHUNK.size))
             file.seek(title + 8, 1)  # the name and the time
             values = np.frombuffer(unpack("zlib", file.read(length - 8), size), dtype)
-        rows = values.reshape(sizes["Y"], -1)[:, : sizes["X"] * sizes.get("C", 1) * samples]
-        return rows.reshape(sizes["Y"], sizes["X"], sizes.get("C", 1), samples).transpose(2, 0, 1, 3)
-
-    samples = sizes.get("S", 1)
+        rows = values.reshape(ny, -1)[:, : nx * channels * samples]
+        return rows.reshape(ny, nx, channels, samples).transpose(2, 0, 1, 3)
 
     def read(time: int, channel: int, box: Slices) -> np.ndarray:
         z, y, x = box
@@ -149,7 +147,7 @@ def _reader(
                 at = {"T": time, "P": place, "Z": k}
                 number = int(np.ravel_multi_index([at[a] for a in loops], [sizes[a] for a in loops])) if loops else 0
                 frame = np.asarray(opened().read_frame(number)) if packed is None else unpacked(number)
-                frame = frame.reshape(sizes.get("C", 1), sizes["Y"], sizes["X"], samples)
+                frame = frame.reshape(channels, ny, nx, samples)
                 out[k - z.start] = frame[channel // samples, y, x, channel % samples]
         return out
 
