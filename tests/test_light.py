@@ -71,6 +71,15 @@ def test_the_kernel_shades_as_its_twin(name, bad):
     np.testing.assert_allclose(image[..., 3], dark[..., 3], atol=1e-6)
 
 
+def test_no_lines_where_the_gradient_of_a_thin_shell_changes_its_sign():
+    z, y, x = np.meshgrid(*[np.arange(24.0) - 11.5] * 3, indexing="ij")
+    shell = 100 * np.exp(-((np.sqrt(x * x + y * y + z * z) - 8) ** 2) / 4)
+    tf = function([0, 20, 100], [0, 0, 0.3])
+    scene = Scene.build(Volume(shell.astype(np.float32), (1.0, 1.0, 1.0)), tf, 1.0).lit(LIGHTS["headlight"])
+    image = render_view(scene, camera(32), RenderSettings(samples=1))
+    assert np.abs(image - render_view_reference(scene, camera(32), step=1 / 32)).max() < 0.012
+
+
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_integers_are_shaded_as_floats(dtype):
     scene = blob(dtype=dtype).lit(LIGHTS["two and the headlight"])

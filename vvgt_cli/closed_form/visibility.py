@@ -16,6 +16,7 @@ from vvgt_cli.closed_form.moments import Cells
 from vvgt_cli.dvr.kernel import FLAGS, absorbed
 from vvgt_cli.dvr.render import BoxFrame, camera_arrays
 from vvgt_cli.dvr.scene import Scene
+from vvgt_cli.dvr.vectors import Vector
 from vvgt_cli.jit.decorators import inlined, kernel, parallel_kernel
 from vvgt_cli.jit.threads import ThreadSlice, iterations
 
@@ -24,7 +25,6 @@ MIN_RAYS = 8  # that meet a cell: with fewer, some cells are met by none and cou
 WORKERS = 4  # each with sums of its own, so that they need no atomics; whatever the threads, for the same bytes
 THIN = 2.0  # pixels of the march: all of a box that is thinner may lie between two rays
 U = nb.uint64  # indices that cannot be negative need no test
-Vector = tuple[float, float, float]
 DEPTH, SEEN, LARGEST = 0, 1, 2  # of a cell's sums over rays: optical depth, its seen part, largest transmittance
 
 

@@ -14,7 +14,6 @@ from vvgt_cli.dvr.kernel import (
     FLAGS,
     OPAQUE,
     U,
-    Vector,
     box_span,
     inverse,
     is_flat,
@@ -26,7 +25,7 @@ from vvgt_cli.dvr.kernel import (
 )
 from vvgt_cli.dvr.layout import Optics, Voxels
 from vvgt_cli.dvr.march import LEAP, direction, shade_segment
-from vvgt_cli.dvr.vectors import add, lane, zeros4
+from vvgt_cli.dvr.vectors import Vector, add, lane, zeros4
 from vvgt_cli.jit.decorators import inlined
 from vvgt_cli.jit.gpu import cuda, free_bytes, gpu_kernel, sent, size_of
 
@@ -81,11 +80,11 @@ def cast(
         met = values_met(before, u0, u1, flat)
         if met[0] >= 0.0 and met[1] > optics.dark[U(int(met[0]))]:
             before_it = trans
-            own, trans, s = pass_segment(voxels, optics, p, d, t - dt, dt, u0, u1, met, zeros4(), trans)
+            own, trans, begin, end = pass_segment(voxels, optics, p, d, t - dt, dt, u0, u1, met, zeros4(), trans)
             if light is None:
                 seen = add(seen, own)
             elif lane(own, 3) > 0.0:
-                r, g, b = shade_segment(own, light, voxels.values, p, d, look, s, t - dt, dt, before_it)
+                r, g, b = shade_segment(own, light, voxels.values, p, d, look, begin, end, before_it)
                 red, green, blue = red + r, green + g, blue + b
         before, u0 = u0, u1
         i += 1

@@ -14,7 +14,7 @@ import numpy as np
 
 from vvgt_cli.dvr.layout import BRICK, BRICK_BITS, Optics, Voxels
 from vvgt_cli.dvr.runs import Run, run_range
-from vvgt_cli.dvr.vectors import Quad, add, lane, mix, row, scale, sub, texel
+from vvgt_cli.dvr.vectors import Quad, Vector, add, lane, mix, row, scale, sub, texel
 from vvgt_cli.jit.decorators import inlined
 
 OPAQUE = 1e-3  # times step^2, as the error of integration goes: the transmittance at which a ray ends
@@ -32,7 +32,6 @@ _x = 0.5 + 0.5 * np.cos((np.arange(8) + 0.5) * math.pi / 8)  # Chebyshev's point
 ABSORBED: tuple[float, ...] = tuple(np.linalg.solve(np.vander(_x, increasing=True), -np.expm1(-_x) / _x).tolist())
 
 U = nb.uint64
-Vector = tuple[float, float, float]
 
 _jit = inlined(fastmath=FLAGS, error_model="numpy", borrowed=True)
 
@@ -171,13 +170,23 @@ def values_met(before: float, u0: float, u1: float, flat: bool) -> tuple[float, 
 
 
 @_jit
+def spread(total: float, first: float, second: float, parts: int) -> tuple[float, float]:
+    """Return where an even distribution with these moments, of ``parts`` of length 1, begins and ends, within them."""
+    if total <= 0.0:
+        return 0.0, 0.0
+    middle = first / total
+    half = math.sqrt(3.0 * max(second / total - middle * middle, 0.0) + 0.25)
+    return max(middle - half, 0.0), min(middle + half, float(parts))
+
+
+@_jit
 def pass_segment(
     voxels: Voxels, optics: Optics, p: Vector, d: Vector, t: float, dt: float, u0: float, u1: float,
     met: tuple[float, float], light: Quad, trans: float,
-) -> tuple[Quad, float, float]:  # fmt: skip
+) -> tuple[Quad, float, float, float]:  # fmt: skip
     """Apply `composite` from t to t + dt of the ray p + t d; in parts if extinction is not flat (`FINER`, `CURVED`).
 
-    ``met``: `values_met`. Last is the t at which, on average, the segment absorbs.
+    ``met``: `values_met`. The last two are where absorption begins and ends, were it even.
     """
     parts, bin_ = 1, U(int(met[0]))
     if trans >= FAINT and met[1] > optics.even[bin_]:
@@ -187,9 +196,9 @@ def pass_segment(
             parts = CURVED
     if parts == 1:
         light, trans = composite(u0, u1, dt, optics, light, trans)
-        return light, trans, t + 0.5 * dt
+        return light, trans, t, t + dt
     (px, py, pz), (dx, dy, dz), part = p, d, dt / parts
-    a, whole, place = u0, trans, 0.0
+    a, whole, place, squared = u0, trans, 0.0, 0.0
     for n in range(1, parts + 1):
         s = t + n * part
         b = u1
@@ -199,8 +208,10 @@ def pass_segment(
             ahead = trans
             light, trans = composite(a, b, part, optics, light, trans)
             place += (ahead - trans) * (n - 0.5)
+            squared += (ahead - trans) * (n - 0.5) * (n - 0.5)
         a = b
-    return light, trans, t + part * place / (whole - trans) if whole > trans else t + 0.5 * dt
+    start, end = spread(whole - trans, place, squared, parts)
+    return light, trans, t + part * start, t + part * end
 
 
 @_jit

@@ -29,7 +29,6 @@ from vvgt_cli.dvr.kernel import (
     SUB_DEPTH,
     TILE,
     U,
-    Vector,
     absorbed,
     any_light,
     blend_texels,
@@ -40,23 +39,31 @@ from vvgt_cli.dvr.kernel import (
     pass_segment,
     sample,
     skip,
+    spread,
     table_coordinate,
     texel_at,
     values_met,
 )
 from vvgt_cli.dvr.layout import LIT, LIT_GRID, MIXED, TUPLES, UNMIXED, Light, Mixture, Optics, Voxels
 from vvgt_cli.dvr.runs import RUN, Run, sample_run, stack_run
-from vvgt_cli.dvr.shading import shading
-from vvgt_cli.dvr.vectors import Quad, add, lane, scale, vector, zeros4
+from vvgt_cli.dvr.shading import gradient, shade_at, shading, unit
+from vvgt_cli.dvr.vectors import Quad, Vector, add, dot, lane, mix, scale, sub, vector, zeros4
 from vvgt_cli.jit.decorators import inlined, parallel_kernel
 from vvgt_cli.jit.threads import ThreadSlice, iterations, next_iteration
 
 P = ParamSpec("P")
-SHADED_TWICE = 0.03  # of the light: a normal of noisy data turns within half a voxel
+SHADED_TWICE = 0.03  # of the light: what a segment absorbs from which on the normal may turn within it
+TURNS, ALIKE = 12, 0.9  # normals that are shaded where it does; squared cosine from which on it does not
 LEAP = 8  # samples of a grid between two looks at the empty-space map
 
 _jit = inlined(fastmath=FLAGS, error_model="numpy", borrowed=True)
 _exact = inlined(error_model="numpy", borrowed=True)  # the same on both sides of a face of blocks: no fast mathematics
+
+
+@_jit
+def slope_on_ray(values: np.ndarray, light: Light, p: Vector, d: Vector, t: float) -> Quad:
+    """Return `gradient` at p + t d."""
+    return gradient(values, light.edge, p[0] + t * d[0], p[1] + t * d[1], p[2] + t * d[2])
 
 
 @_jit
@@ -67,28 +74,38 @@ def shade_segment(
     p: Vector,
     d: Vector,
     look: Vector,
-    s: float,
-    t: float,
-    dt: float,
+    start: float,
+    end: float,
     trans: float,
 ) -> tuple[float, float, float]:
     """Shade a segment's ``own`` (r, g, b, alpha), seen along ``look``; no colour exceeds its alpha.
 
-    It goes from t to t + dt, ``trans`` of the light passes what is before it, and it absorbs, on average, at p + s d.
-    Light is taken there, or, where the segment absorbs more than `SHADED_TWICE` and light is not traced to a grid, as
-    the mean of a quarter of dt before and behind.
+    ``trans`` of the light passes what is before it. It absorbs from ``start`` to ``end`` of the ray p + t d; in the
+    middle light is taken that is traced to a grid, and the normal of a segment that absorbs at most `SHADED_TWICE`. Of
+    others two normals are shaded, or `TURNS` where the gradient, quadratic along the ray, turns: where its sign changes
+    a surface is dark on so short a way that single samples of it would draw lines.
     """
-    most = lane(own, 3)
-    times, apart = (2, 0.5 * dt) if most > SHADED_TWICE * trans and not light.traced else (1, 0.0)
+    most, middle = lane(own, 3), 0.5 * (start + end)
+    if light.traced:
+        x, y, z = p[0] + middle * d[0], p[1] + middle * d[1], p[2] + middle * d[2]
+        red, green = shade_at(light, 0, x, y, z) * lane(own, 0), shade_at(light, 1, x, y, z) * lane(own, 1)
+        return min(red, most), min(green, most), min(shade_at(light, 2, x, y, z) * lane(own, 2), most)
     red = green = blue = 0.0
+    thin = most <= SHADED_TWICE * trans
+    a = slope_on_ray(values, light, p, d, middle if thin else start)
+    b, bend, times = a, zeros4(), 1
+    if not thin:
+        b = slope_on_ray(values, light, p, d, end)
+        along = dot(a, b)
+        times = 2 if along > 0.0 and along * along > ALIKE * dot(a, a) * dot(b, b) else TURNS
+        if times == TURNS:
+            bend = sub(scale(4.0, slope_on_ray(values, light, p, d, middle)), scale(2.0, add(a, b)))
     for n in range(times):
-        at = min(max(s + (n - 0.5) * apart, t), t + dt)
-        r, g, b, white = shading(
-            values, light, p[0] + at * d[0], p[1] + at * d[1], p[2] + at * d[2], look[0], look[1], look[2]
-        )  # fmt: skip
+        f = (n + 0.5) / times
+        factor, white = shading(light, unit(add(mix(a, b, f), scale(f * (1.0 - f), bend))), look)
         white *= most
-        red, green = red + min(r * lane(own, 0) + white, most), green + min(g * lane(own, 1) + white, most)
-        blue += min(b * lane(own, 2) + white, most)
+        red, green = red + min(factor * lane(own, 0) + white, most), green + min(factor * lane(own, 1) + white, most)
+        blue += min(factor * lane(own, 2) + white, most)
     return red / times, green / times, blue / times
 
 
@@ -122,12 +139,14 @@ def _through_values(
                 if i + n > first and met[0] >= 0.0 and met[1] > optics.dark[U(int(met[0]))]:
                     here = t + (n - 1) * dt
                     if light is None:
-                        seen, trans, _ = pass_segment(voxels, optics, p, d, here, dt, u0, u1, met, seen, trans)
+                        seen, trans, _, _ = pass_segment(voxels, optics, p, d, here, dt, u0, u1, met, seen, trans)
                     else:
                         ahead = trans
-                        own, trans, s = pass_segment(voxels, optics, p, d, here, dt, u0, u1, met, zeros4(), trans)
+                        own, trans, begin, end = pass_segment(
+                            voxels, optics, p, d, here, dt, u0, u1, met, zeros4(), trans
+                        )  # fmt: skip
                         if lane(own, 3) > 0.0:
-                            r, g, b_ = shade_segment(own, light, voxels.values, p, d, look, s, here, dt, ahead)
+                            r, g, b_ = shade_segment(own, light, voxels.values, p, d, look, begin, end, ahead)
                             red, green, blue = red + r, green + g, blue + b_
                     if trans < opaque:
                         break
@@ -165,13 +184,13 @@ def _layer_mean(mixture: Mixture, k: int, u0: float, u1: float) -> Quad:
 def _pass_layers(
     mixture: Mixture, p: Vector, d: Vector, t: float, dt: float, a: Quad, b: Quad, then: Run, now: Run, within: Run,
     own: Any, seen: Quad, trans: float,
-) -> tuple[Quad, float, float]:  # fmt: skip
+) -> tuple[Quad, float, float, float]:  # fmt: skip
     """Return `pass_segment` of a mixture with scalars, from texel ``a`` and coordinates ``then`` to ``b`` and ``now``.
 
     ``then`` becomes ``now``, ``within`` is overwritten. ``own`` is None, or is filled with (r, g, b, alpha) of each
     layer of scalars and, behind them, of the texels.
     """
-    count, whole, place = mixture.scalars.shape[0], trans, 0.0
+    count, whole, place, squared = mixture.scalars.shape[0], trans, 0.0, 0.0
     total, shown, steep = scale(0.5, add(a, b)), lane(a, 3) + lane(b, 3) > 0.0, False
     for k in range(count):
         low, high = min(then[k], now[k]), max(then[k], now[k])
@@ -187,7 +206,7 @@ def _pass_layers(
     if not shown:
         for k in range(count):
             then[k] = now[k]
-        return seen, trans, t
+        return seen, trans, t, t
     parts = min(int(dt * lane(total, 3) / SUB_DEPTH) + 1, PARTS)
     if steep and trans >= FAINT:
         parts = max(parts, FINER)
@@ -214,7 +233,9 @@ def _pass_layers(
         for k in range(count):
             then[k] = within[k]
         a, trans, place = c, trans - f * depth, place + f * depth * (n - 0.5)
-    return seen, trans, t + part * place / (whole - trans) if whole > trans else t + 0.5 * dt
+        squared += f * depth * (n - 0.5) * (n - 0.5)
+    start, end = spread(whole - trans, place, squared, parts)
+    return seen, trans, t + part * start, t + part * end
 
 
 @_jit
@@ -253,24 +274,24 @@ def _through_mixture(
                     then[k] = now[k]
         elif light is None:
             if scalars is not None:
-                seen, trans, _ = _pass_layers(mixture, p, d, here, dt, a, b, then, now, within, None, seen, trans)
+                seen, trans, _, _ = _pass_layers(mixture, p, d, here, dt, a, b, then, now, within, None, seen, trans)
             elif lane(a, 3) + lane(b, 3) > 0.0:
                 seen, trans = blend_texels(a, b, dt, seen, trans)
         else:
-            own, s = zeros4(), t - 0.5 * dt
+            own, begin, end = zeros4(), here, t
             if scalars is not None:
-                _, trans, s = _pass_layers(mixture, p, d, here, dt, a, b, then, now, within, parts, own, trans)
+                _, trans, begin, end = _pass_layers(mixture, p, d, here, dt, a, b, then, now, within, parts, own, trans)
                 for k in range(scalars.shape[0]):
                     own = vector(parts[4 * k], parts[4 * k + 1], parts[4 * k + 2], parts[4 * k + 3])
                     if lane(own, 3) > 0.0:
-                        r, g, b_ = shade_segment(own, light, scalars[k], p, d, look, s, here, dt, ahead)
+                        r, g, b_ = shade_segment(own, light, scalars[k], p, d, look, begin, end, ahead)
                         red, green, blue = red + r, green + g, blue + b_
                 k = 4 * scalars.shape[0]
                 own = vector(parts[k], parts[k + 1], parts[k + 2], parts[k + 3])
             elif lane(a, 3) + lane(b, 3) > 0.0:
                 own, trans = blend_texels(a, b, dt, own, trans)
             if lane(own, 3) > 0.0:
-                r, g, b_ = shade_segment(own, light, voxels.values, p, d, look, s, here, dt, ahead)
+                r, g, b_ = shade_segment(own, light, voxels.values, p, d, look, begin, end, ahead)
                 red, green, blue = red + r, green + g, blue + b_
         a, known = b, True
         i += 1

@@ -22,7 +22,6 @@ import numpy as np
 from vvgt_cli.dvr.kernel import (
     FLAGS,
     U,
-    Vector,
     box_span,
     inverse,
     mean_optics,
@@ -33,7 +32,7 @@ from vvgt_cli.dvr.kernel import (
 from vvgt_cli.dvr.layout import BRICK, BRICK_BITS, LIT_GRID, TUPLES, Optics, Texels, Voxels
 from vvgt_cli.dvr.shading import normal
 from vvgt_cli.dvr.sky import SKY, Sky
-from vvgt_cli.dvr.vectors import lane
+from vvgt_cli.dvr.vectors import Vector, lane
 from vvgt_cli.jit.decorators import inlined, parallel_kernel
 from vvgt_cli.jit.threads import ThreadSlice, next_iteration
 

@@ -9,7 +9,7 @@ import numba as nb
 import numpy as np
 
 from vvgt_cli.dvr.layout import Light
-from vvgt_cli.dvr.vectors import Quad, four, lane, mix, sub, vector
+from vvgt_cli.dvr.vectors import Quad, Vector, four, lane, mix, sub, vector
 from vvgt_cli.jit.decorators import inlined
 
 FLAGS = {"contract", "nsz", "arcp", "afn"}  # no nnan/ninf: non-finite voxels are data
@@ -40,11 +40,11 @@ def _line(values: np.ndarray, k: Any, j: Any, i: int) -> Quad:
 
 
 @_jit
-def normal(values: np.ndarray, edge: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Return the gradient's direction (x, y, z) at voxel coordinates, box frame; zeros where there is none.
+def gradient(values: np.ndarray, edge: np.ndarray, x: float, y: float, z: float) -> Quad:
+    """Return the gradient (x, y, z, 0) at voxel coordinates, box frame.
 
     Central differences at the eight voxels around, interpolated trilinearly; ``values`` (nz, ny, nx), ``edge`` (3,) of
-    `Light`. There is none where all differences are zero, or one is not finite.
+    `Light`.
     """
     nz, ny, nx = values.shape
     x = min(max(x, 0.0), nx - 1.0)
@@ -64,12 +64,24 @@ def normal(values: np.ndarray, edge: np.ndarray, x: float, y: float, z: float) -
     below = mix(sub(v11, _line(values, k_, j1, i)), sub(_line(values, k2, j1, i), v01), fz)
     along = mix(above, below, fy)
     gz = (1.0 - fx) * lane(along, 1) + fx * lane(along, 2)
-    gx, gy, gz = gx / edge[0], gy / edge[1], gz / edge[2]
+    return vector(gx / edge[0], gy / edge[1], gz / edge[2], 0.0)
+
+
+@_jit
+def unit(slope: Quad) -> tuple[float, float, float]:
+    """Return a gradient's direction (x, y, z); zeros where it is zero or not finite."""
+    gx, gy, gz = lane(slope, 0), lane(slope, 1), lane(slope, 2)
     squared = gx * gx + gy * gy + gz * gz
     if not (0.0 < squared < np.inf):
         return 0.0, 0.0, 0.0
     length = math.sqrt(squared)
     return gx / length, gy / length, gz / length
+
+
+@_jit
+def normal(values: np.ndarray, edge: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Return the direction of `gradient`, as `unit`."""
+    return unit(gradient(values, edge, x, y, z))
 
 
 @_jit
@@ -130,18 +142,14 @@ def _fixed_highlights(light: Light, n0: float, n1: float, n2: float, d0: float, 
 
 
 @_jit
-def shading(
-    values: np.ndarray, light: Light, x: float, y: float, z: float, d0: float, d1: float, d2: float
-) -> tuple[float, float, float, float]:
-    """Return factors of red, green and blue, and white to add at voxel coordinates, seen along the unit vector d.
+def shading(light: Light, normal: Vector, look: Vector) -> tuple[float, float]:
+    """Return the factor of colours, and white to add, of a ``normal`` (zeros: none), seen along the unit ``look``.
 
-    d is of the box frame.
+    Both are of the box frame.
     """
-    if light.traced:
-        return shade_at(light, 0, x, y, z), shade_at(light, 1, x, y, z), shade_at(light, 2, x, y, z), 0.0
-    n0, n1, n2 = normal(values, light.edge, x, y, z)
+    (n0, n1, n2), (d0, d1, d2) = normal, look
     if n0 == 0.0 and n1 == 0.0 and n2 == 0.0:
-        return light.ambient, light.ambient, light.ambient, 0.0
+        return light.ambient, 0.0
     diffuse, white = fixed_diffuse(light, n0, n1, n2), 0.0
     facing = min(abs(n0 * d0 + n1 * d1 + n2 * d2), 1.0)
     if light.head:
@@ -150,5 +158,4 @@ def shading(
         white = _fixed_highlights(light, n0, n1, n2, d0, d1, d2)
         if light.head:
             white += _power(facing, light.power)
-    factor = light.ambient + light.diffuse * diffuse
-    return factor, factor, factor, light.specular * white
+    return light.ambient + light.diffuse * diffuse, light.specular * white

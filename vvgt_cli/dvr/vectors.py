@@ -28,6 +28,7 @@ class QuadType(types.Type):
 
 
 quad = QuadType()
+Vector = tuple[float, float, float]
 Quad: TypeAlias = Any  # a value of that type, in annotations: Python has none like it
 
 
@@ -145,3 +146,10 @@ def scale(typingctx: Any, a: Any, b: Any) -> Any:
 def mix(a: Quad, b: Quad, share: float) -> Quad:
     """Interpolate linearly from a to b."""
     return add(a, scale(share, sub(b, a)))
+
+
+@inlined(error_model="numpy", _nrt=False)
+def dot(a: Quad, b: Quad) -> float:
+    """Return the scalar product of the first three lanes."""
+    total: float = lane(a, 0) * lane(b, 0) + lane(a, 1) * lane(b, 1) + lane(a, 2) * lane(b, 2)
+    return total
