@@ -336,6 +336,12 @@ def test_zarr_array_by_itself_and_sharded(tmp_path: Path) -> None:
     np.testing.assert_array_equal(volume.data, VALUES.astype("f4"))
 
 
+def test_the_axis_that_is_not_of_space_holds_components(tmp_path: Path) -> None:
+    store, both = str(tmp_path / "v.zarr"), np.stack([VALUES, -VALUES], axis=2).astype("f4")
+    zarr.create_array(store, data=both, dimension_names=["z", "y", "run", "x"])
+    np.testing.assert_array_equal(read_volume(store, ReadOptions(component=1)).data, both[:, :, 1])
+
+
 def test_ome_zarr(tmp_path: Path) -> None:
     store = tmp_path / "v.ome.zarr"
     group = zarr.open_group(str(store), mode="w", zarr_format=2)
