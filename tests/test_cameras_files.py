@@ -90,6 +90,7 @@ BAD = {
     "text width": (json.dumps({**LENS, "w": "32", "frames": [FRAME]}), "expected a number"),
     "no lens": (json.dumps({"w": 32, "h": 32, "frames": [FRAME]}), "focal length"),
     "negative lens": (json.dumps({**LENS, "fl_x": -3, "frames": [FRAME]}), "expected > 0"),
+    "negative up": (json.dumps({**LENS, "fl_y": -3, "frames": [FRAME]}), "expected > 0"),
     "twice": (json.dumps({**LENS, "frames": [FRAME, FRAME]}), "a second image"),
 }
 
