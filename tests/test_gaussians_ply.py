@@ -206,7 +206,8 @@ def test_other_programs_property_order_is_read():
     rows = np.zeros(2, np.dtype([(f, "u1" if f == "red" else "<f4") for f in fields]))
     rows["rot_0"], rows["y"], rows["opacity"] = 1, (3, 4), (5, 6)
     comments = ("by hand", "vvgt later a fact of a later version")
-    header = "ply\r\nformat binary_little_endian 1.0\r\n" + "".join(f"comment {c}\r\n" for c in comments)
+    header = "ply\r\nformat binary_little_endian 1.0\r\nobj_info none\r\n\r\n"
+    header += "".join(f"comment {c}\r\n" for c in comments)
     header += "element vertex 2\r\n"
     header += "".join(f"property {'uchar' if f == 'red' else 'float'} {f}\r\n" for f in fields) + "end_header\r\n"
     gaussians, parsed = read_ply(io.BytesIO(header.encode() + rows.tobytes()))
@@ -215,10 +216,14 @@ def test_other_programs_property_order_is_read():
 
 
 def test_describe_counts_and_ranges():
-    gaussians = random_gaussians(20)
-    summary = describe(*read_ply(io.BytesIO(written(gaussians, up="y"))))
+    gaussians, header = read_ply(io.BytesIO(written(random_gaussians(20), up="y")))
+    summary = describe(gaussians, header)
     assert (summary["gaussians"], summary["bytes_per_gaussian"], summary["up"]) == (20, 68, "y")
-    assert summary["sigma"][2] == pytest.approx(float(np.exp(gaussians.log_scales.max())), rel=1e-5)
+    for key, values in (("sigma", np.exp(gaussians.log_scales)), ("opacity", gaussians.opacity)):
+        assert summary[key] == pytest.approx([values.min(), np.median(values), values.max()], rel=1e-5)
+    for key, values in (("box", gaussians.means), ("color", gaussians.colors)):
+        ends = values.min(axis=0).tolist(), values.max(axis=0).tolist()
+        assert (summary[f"{key}_min"], summary[f"{key}_max"]) == ends
 
 
 @pytest.mark.long
