@@ -77,6 +77,17 @@ def test_gradients_reach_every_parameter(config):
         assert parameter.grad.abs().max() > 0, name
 
 
+def test_queries_and_keys_are_normalised_within_views_and_over_all():
+    torch.manual_seed(0)
+    layer, tokens = randomised(model.AlternatingAttention(TINY.image)), torch.randn(2, 5, TINY.image.width)
+    for block in (layer.frame, layer.whole):
+        before, rows = block(tokens), slice(0, 2 * TINY.image.width)  # queries, then keys
+        with torch.no_grad():
+            block.attn.qkv.weight[rows] *= 3
+            block.attn.qkv.bias[rows] *= 3
+        assert torch.allclose(block(tokens), before, atol=1e-4)
+
+
 def naive_epipolar(module, x, points, matrices, eyes, maps):
     """Eq. 7 with all keys of a token side by side, one token at a time, torch's own bilinear sampling."""
     uv, seen = layers.project(points, matrices)
