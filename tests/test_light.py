@@ -185,6 +185,7 @@ def test_presets_are_taken_and_overruled():
     assert not lighting("above", preset=preset).depends_on_view
     assert lighting("above").depends_on_view
     assert preset.depends_on_view
+    assert not replace(preset, diffuse=0.0).depends_on_view
 
 
 @pytest.mark.parametrize(
