@@ -94,6 +94,12 @@ def run(tmp_path_factory):
 LOOK = ("--tf", "viridis:0.1,1", "--size", 24)
 
 
+def test_a_gif_of_few_colours_has_them_all(tmp_path):
+    picture = (np.random.default_rng(0).integers(0, 256, (4, 4, 3)) / 255).astype(np.float32)
+    write_movie(tmp_path / "a.gif", [picture, picture[::-1]])
+    np.testing.assert_allclose(gif(tmp_path / "a.gif")[0], [picture, picture[::-1]], atol=1e-6)
+
+
 @pytest.mark.parametrize("blocks", [(), ("--blocks", 16)])
 def test_a_series_of_volumes_is_a_movie_over_time(run, tmp_path, vvgt, blocks):
     """Each frame is the picture of its volume in the range of all; a dark one is the background."""
