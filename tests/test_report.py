@@ -65,7 +65,7 @@ def scene_report(tmp_path_factory):
     step = np.zeros(14)
     step[3:6] = -3
     model = write_model(folder / "worse", step)
-    args = ["report", "example:blob:10", *SMALL, "--model", model, "-o", folder / "out", "--quiet"]
+    args = ["report", "example:blob:10", *SMALL, "--model", model, "-o", folder / "out", "--quiet", "--threads", 1]
     assert vvgt([str(arg) for arg in args]) == 0
     return folder / "out", json.loads((folder / "out" / "report.json").read_text())
 
@@ -98,7 +98,9 @@ def test_a_report_writes_every_file_and_scores_every_run(scene_report):
     assert found["knee"] in found["front"]
     assert found["command_line"].startswith("vvgt report example:blob:10 --output ")
     assert "--steps 2" in found["command_line"]
+    assert "--threads" not in found["command_line"]
     assert found["machine"]["cpu"]
+    assert found["machine"]["threads"] == 1
 
 
 def test_the_page_opens_offline_and_shows_its_pictures(scene_report):
