@@ -168,6 +168,12 @@ def test_values_are_hounsfield_units_where_a_function_of_those_says_so(stretched
     assert [one.facts[0]["ct"] for one in found] == [True, True]  # windows to choose from
 
 
+def test_only_a_layer_alone_has_the_statistics_of_the_source():
+    one = load(SourceRequest(Volume(np.arange(64, dtype=np.int16).reshape(4, 4, 4)), tf="gray"))
+    assert [layer.statistics is one.overall for layer in one.page_layers] == [True]
+    assert [layer.statistics for layer in replace(one, layers=one.layers * 2).page_layers] == [None, None]
+
+
 def test_huge_ranges_fit_into_16_bits():
     data = np.random.default_rng(3).normal(size=(20, 20, 20))
     data[0, 0, 0], data[5, 5, 5] = -1e9, 1e9
