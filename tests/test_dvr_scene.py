@@ -134,6 +134,14 @@ def test_kernel_values_are_native_contiguous_read_only_and_shared_where_they_can
             assert not values.flags.writeable
 
 
+@pytest.mark.parametrize("kind", ["i4", "f8"])
+def test_kernel_values_of_wide_types_are_from_0_to_1(kind):
+    data = np.random.default_rng(2).integers(10**9, 10**9 + 100, (4, 5, 6)).astype(kind)
+    values, slope, intercept = kernel_values(Volume(data))
+    assert (values.min(), values.max()) == (0, 1)
+    np.testing.assert_allclose(slope * values.astype(np.float64) + intercept, data, atol=1e-3, rtol=0)
+
+
 @pytest.mark.parametrize("shape", [(1, 1, 1), (8, 9, 17), (30, 16, 25)])
 def test_the_empty_map_is_the_distance_to_the_nearest_visible_brick(shape):
     rng = np.random.default_rng(4)
