@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.processes import start
+from vvgt_cli.commands.process import ending
 
 # A march of so many rays that it takes minutes, in one kernel, while a file is being written.
 LONG = """
@@ -113,3 +114,16 @@ def test_no_kernel_that_is_being_called_swallows_a_signal(name, tmp_path):
     status, line = (130, "interrupted") if name == "SIGINT" else (128 + number, f"ended by {name}")
     assert out.split() == 200 * [str(status)], told[-2000:]
     assert told.splitlines() == 200 * [f"vvgt: error: {line}"]
+
+
+def test_a_step_that_ends_is_told_of_signals_that_are_not_ignored():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN), signal.getsignal(signal.SIGTERM)
+    try:
+        with ending() as caught:
+            assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+            assert signal.getsignal(signal.SIGTERM) is not before[1]
+            signal.raise_signal(signal.SIGTERM)
+        assert caught == [signal.SIGTERM]
+        assert signal.getsignal(signal.SIGTERM) is before[1]
+    finally:
+        signal.signal(signal.SIGHUP, before[0])
