@@ -192,8 +192,10 @@ def test_init_in_blocks_reports_its_error_against_the_volume(vvgt, tmp_path):
     for blocks in ("32", "128"):
         run = vvgt.ok("init", path, "-o", tmp_path / f"{blocks}.ply", *FIT[:-1], "--blocks", blocks, "--report", "-")
         notes.append(re.search(r"PSNR ([\d.]+) dB .* 3 views of 150 px, through all voxels", run.err))
-        scores = json.loads(run.out)["scores"]
+        report = json.loads(run.out)
+        scores = report["scores"]
         assert f"{scores['psnr']:.2f}" == notes[-1][1]
+        assert report["bytes"] == (tmp_path / f"{blocks}.ply").stat().st_size
     assert notes[0][1] == notes[1][1]
     scene, gaussians = load(SourceRequest(str(path))).scene(), read_ply(tmp_path / "32.ply")[0]
     seen = cast_views(150)
