@@ -10,7 +10,7 @@ from tests import paths_twin
 from tests.test_formats import errors
 from tests.test_light import blob, camera, function
 from vvgt_cli.dvr import RenderSettings, Scene, render_view, render_view_reference
-from vvgt_cli.dvr.light import sphere
+from vvgt_cli.dvr.light import shade_cell, sphere
 from vvgt_cli.dvr.sky import COLUMNS, ROWS, Sky, directions, sky_of
 from vvgt_cli.dvr.traced import _doubled, _halved, lines
 from vvgt_cli.errors import UsageError
@@ -198,6 +198,11 @@ def test_views_lose_no_light_where_colors_vary_along_a_ray():
     ratio = (image[inside] / traced[inside]).mean(axis=0)
     assert ratio.min() > 0.85  # 0.60 without
     assert ratio.max() < 1.05
+
+
+def test_cells_of_light_are_larger_where_a_volume_is():
+    shapes = (128, 128, 128), (129, 128, 128), (600, 500, 400), (1, 1, 1 << 23)
+    assert [shade_cell(shape) for shape in shapes] == [1, 2, 4, 4]
 
 
 def test_what_cells_gather_is_handed_down_and_up_by_the_same_weights():
