@@ -12,6 +12,9 @@ LISTS = (  # file, what stands before the list and after it, the list
     ("vvgt_cli/integrations/blender/gaussian_splats/__init__.py", 'NAMES = "', '"', ";".join(PATTERNS)),
     ("vvgt_cli/integrations/slicer/GaussianSplats.py", '"Gaussian splats (', ')"]', " ".join(PATTERNS[1:])),
     ("vvgt_cli/integrations/napari.yaml", "filename_extensions: [", "]", ", ".join(f'"{one}"' for one in TOLD)),
+    ("vvgt_cli/integrations/paraview_plugin.py", "ENDINGS = [", "]", ", ".join(f'"{one[1:]}"' for one in ENDINGS)),
+    ("docs/programs.md", 'then offers "Gaussian splats" (', ")", ", ".join(f"`{one}`" for one in ENDINGS)),
+    ("docs/programs.md", "File > Import > Gaussian splats* reads ", ", all but", ", ".join(f"`{e}`" for e in ENDINGS)),
     ("docs/programs.md", 'offers "Gaussian splats files" (', ")", ", ".join(f"`{one}`" for one in TOLD)),
 )
 

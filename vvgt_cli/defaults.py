@@ -7,5 +7,5 @@ EARLY = 56  # where nobody sees a difference after these
 MAX_STEPS = 400  # where a target or a time budget decides when to end
 FEWEST_STEPS = 8  # fewer are not worth rendering views for
 WARM_STEPS = 50  # of a round from the previous frame, or from the previous look
-REPORT_STEPS = (25, STEPS, 200, 400)  # of 'vvgt report'
+REPORT_STEPS = (25, EARLY, STEPS, MAX_STEPS)  # of 'vvgt report'
 INIT, METHOD, RULE = "moments", "axes", "inria"

@@ -33,7 +33,8 @@ class VbmOptions:
         method: "moments", "wavelet" (isotropic bank) or "uniform" (random samples).
         seed: of the random samples.
         degree: of the harmonics that colours have under a light that depends on the view.
-        values: cells are split where values differ, of which red is the value and green its square, shares of a range.
+        values: cells are split where values differ, for live files: the scene's red encodes the value, green its
+            square, both scaled to [0, 1].
     """
 
     max_gaussians: int = MAX_GAUSSIANS
@@ -69,7 +70,7 @@ class Start:
 
 
 def initialise(scene: Scene, options: VbmOptions, progress: ProgressCallback | None = None) -> Start:
-    """Return Gaussians by the closed form alone, without rendering; none where no view sees anything."""
+    """Return Gaussians by the closed form alone, without fitting to pictures; none where no view sees anything."""
     from vvgt_cli.closed_form.closed_form import closed_form
 
     form = closed_form(

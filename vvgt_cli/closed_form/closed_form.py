@@ -75,7 +75,7 @@ class ClosedForm(Pyramid):
     def cut_by_error(self, drawn: Gaussians, cameras: Sequence[Camera], views: np.ndarray, rule: Rule) -> Gaussians:
         """Return `gaussians` of cells chosen by the errors of ``drawn`` that views (n, h, w, 4) show, by ``rule``.
 
-        Where some of those drawn are hidden in all views, more are cut than the budget has, and the hidden skipped.
+        Where no view sees some of those drawn, more cells are cut than the budget has, and those not seen are dropped.
         """
         score = split_score(self.tree)
         ids = select(self.tree, self.budget, score)

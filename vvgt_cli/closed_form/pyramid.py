@@ -1,4 +1,4 @@
-"""What a pyramid of cells makes Gaussians with, wherever its cells are, and the tree of one of its tiles."""
+"""`Pyramid` turns cells into Gaussians; subclasses keep the cells in memory or on disk, as trees of tiles."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Tile(NamedTuple):
 
 @dataclass(frozen=True)
 class Pyramid:
-    """Cells of a volume with what their Gaussians need of all of it; subclasses keep the cells.
+    """Cells of a volume with the data of the whole volume that every Gaussian needs; subclasses keep the cells.
 
     Attributes:
         seen: visibility of cells from the training views.

@@ -72,7 +72,9 @@ def mix_neighbours(
 
 
 def sharpened(gaussians: Gaussians, seen: np.ndarray, half: np.ndarray) -> Gaussians:
-    """Return Gaussians whose colours, once neighbours are mixed in, show what theirs showed; harmonics too.
+    """Return Gaussians with colours corrected so that, drawn over each other, they look like their cells.
+
+    Harmonics are corrected too.
 
     Args:
         gaussians: of the closed form, box frame, their colours those of their cells.

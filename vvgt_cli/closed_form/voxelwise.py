@@ -1,4 +1,4 @@
-"""Moments of cells of whole voxels: one point a voxel where the function is linear_until, else eight.
+"""Moments of cells of whole voxels: one point a voxel where the function is straight over its values, else eight.
 
 Bricks of 8^3 voxels with their neighbours are laid out as table coordinates. Range, mean and mean slopes of the
 trilinear values over each voxel's box follow from the 27 voxels around, for all of a brick at once, axis by axis.

@@ -175,8 +175,8 @@ def command(**options: Any) -> None:
     The result is scored on test views that it was not fitted to, and the error is printed. --target-psnr,
     --time-budget and --max-megabytes decide which stages run. Ctrl-C ends gradient descent early and writes the result.
 
-    OUT.ply may end in .html (a page that opens in a browser), .spz, .compressed.ply, .sog, .glb, .usdc or .usdz.
-    FOLDER/lod-meta.json writes levels of detail that viewers load as they are needed.
+    OUT.ply may end in .html (a page that opens in a browser), .spz, .v4.spz, .compressed.ply, .sog, .glb, .usdc or
+    .usdz. FOLDER/lod-meta.json writes levels of detail that viewers load as they are needed.
 
     For a time series, VOLUME is a glob or a file with several time steps, and OUT.ply or FOLDER has a placeholder: {}
     or {:04d} for the frame's number, {step}, {time} or {stem} (name) of its input. All frames share one function and

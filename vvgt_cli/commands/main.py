@@ -12,7 +12,6 @@ import time
 import traceback
 import warnings
 from collections.abc import Sequence
-from difflib import get_close_matches
 
 import click
 
@@ -68,9 +67,9 @@ class LazyGroup(click.Group):
         """Find the command of a command line; suggest similar names for an unknown one."""
         name = args[0]
         if name not in COMMANDS and not name.startswith("-"):
-            near = get_close_matches(name, COMMANDS)
-            hint = f"did you mean {' or '.join(near)}?" if near else f"expected one of {', '.join(COMMANDS)}"
-            raise UsageError(f"no command {name!r}; {hint}")
+            from vvgt_cli.volume.components import expected
+
+            raise UsageError(f"no command {name!r}; {expected(name, COMMANDS, len(COMMANDS))}")
         return super().resolve_command(ctx, args)
 
 

@@ -49,8 +49,8 @@ def text_of(part: Part) -> str:
 class Labels(Batch):
     """The labels of a label map, without transparent ones, converted as a whole and divided; of layers, those of each.
 
-    They have at most ``max_gaussians`` Gaussians together, of which each layer gets as many. Hidden labels get a share
-    by the labels' surfaces (voxels to the power of 2/3), visible ones the rest.
+    They have at most ``max_gaussians`` Gaussians together, shared evenly among the layers. Hidden labels get a share by
+    the labels' surfaces (voxels to the power of 2/3), visible ones the rest.
     """
 
     kind = LABELS

@@ -171,7 +171,7 @@ class Planner:
         return plan
 
     def _improvements(self, plan: Plan, left: float | None) -> list[Stage]:
-        """Return the stages that need views: gradient descent for the given steps or time, or as many as pay off."""
+        """Return the stages that need views: gradient descent by `most_steps`, fewer if time is short."""
         workload = plan.workload
         network, left = self._network(plan, left)
         few = self.fit.steps is not None and self.fit.steps < ENOUGH_STEPS and left is None
@@ -301,7 +301,7 @@ class WarmStart(ABC):
     def try_start(self, work: Work, plan: Plan, request: ConvertRequest) -> bool:
         """Derive the Gaussians of ``work`` from the earlier ones, and return whether they are as good as new ones.
 
-        If they are, only scores remain of ``plan``, of the whole if these are asked for; else ``work`` is reset.
+        If they are, ``plan`` keeps only `TestViews`, and the other scores if ``scored_whole``; else ``work`` is reset.
         """
         why = self.obstacle(work, plan, request)
         if why is None:

@@ -19,6 +19,7 @@ from vvgt_cli.look import LabelTable, Lighting, LightOptions, TransferFunction, 
 from vvgt_cli.look.resolve import unit_of_values
 from vvgt_cli.look.tables import exposed_distance
 from vvgt_cli.volume import Volume
+from vvgt_cli.volume.components import expected
 
 # function or label table of each layer, with its opacity unit distance (world length)
 LayerLooks = Sequence[tuple[TransferFunction | LabelTable, float]]
@@ -172,7 +173,8 @@ def layer_number(name: str, layers: Sequence[LiveFacts], asked: str) -> int:
     exact = [k for k, layer in enumerate(layers) if layer.name == asked]
     numbers = exact or [k for k, layer in enumerate(layers) if asked.lower() in layer.name.lower()]
     if len(numbers) != 1:
-        raise UsageError(f"{name}: --layer {asked}: {len(numbers) or 'no'} layers of that name; {_listed(layers)}")
+        hint = _listed(layers) if numbers else expected(asked, [layer.name for layer in layers])
+        raise UsageError(f"{name}: --layer {asked}: {len(numbers) or 'no'} layers of that name; {hint}")
     return numbers[0]
 
 

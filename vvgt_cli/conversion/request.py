@@ -116,7 +116,7 @@ class ConvertRequest:
         story: of pages, not yet checked against the volume.
         scored: score the result, for which views are rendered; without, it is the closed form alone.
         all_views: score on all ten test views, by SSIM and FLIP too, as with a report.
-        shares_output: the output holds other clouds, too, so that a device's limit of bytes is not for this one.
+        shares_output: the output holds other clouds, too, so a device's limit of bytes does not apply.
     """
 
     source: SourceRequest

@@ -50,7 +50,7 @@ class ViewRenderer(Viewed, Protocol):
     """A renderer of pictures of a volume."""
 
     def expect(self, pictures: Sequence[Picture]) -> None:
-        """Announce pictures, so that a volume in blocks can render them in a single pass."""
+        """Announce pictures: a volume in blocks renders them in a single pass, one in memory on request."""
 
     def forget(self, picture: Picture) -> None:
         """Release a picture that will not be requested again."""

@@ -1,4 +1,4 @@
-"""Volumes other than one scalar field: label maps, colours, channels, and summed layers (docs/layers.md)."""
+"""Opening of files under their look: a scalar field, label maps, colours, channels; and layers (docs/layers.md)."""
 
 from __future__ import annotations
 

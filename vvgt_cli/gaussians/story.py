@@ -16,7 +16,7 @@ from vvgt_cli.files import read_text
 from vvgt_cli.look import MAX_LIGHT, LabelTable
 from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.look.readers.names import names
-from vvgt_cli.volume.components import listed
+from vvgt_cli.volume.components import expected
 
 if TYPE_CHECKING:
     from vvgt_cli.gaussians.formats.page_values import PageLayer
@@ -247,8 +247,8 @@ def _resolved(step: dict[str, Any], layers: Sequence[PageLayer], where: str) -> 
     look, function = layers[number].look, step.get("function")
     if function is not None and isinstance(look, LabelTable):
         raise DataError(f"{where}: function; layer {number} has labels: expected labels")
-    if isinstance(function, str) and function not in (known := [*names(), look.name]):
-        raise DataError(f"{where}: function {function!r}; expected one of {', '.join(dict.fromkeys(known))}")
+    if isinstance(function, str) and function not in (known := dict.fromkeys([*names(), look.name])):
+        raise DataError(f"{where}: function {function!r}; {expected(function, known)}")
     distance = function.get("opacity_unit_distance") if isinstance(function, Mapping) else None
     if distance is not None and not math.isclose(distance, layers[number].distance, rel_tol=1e-3):
         own = layers[number].distance
@@ -271,6 +271,6 @@ def _numbered(one: Mapping[str, Any], table: LabelTable, where: str) -> dict[str
     key = "name" if "name" in one else "number"
     numbers = [label.number for label in table.structures if getattr(label, key) == one[key]]
     if not numbers:
-        known = listed([str(getattr(label, key)) for label in table.structures], ", ", 8)
-        raise DataError(f"{where}: no label {one[key]!r}; expected one of {known}")
+        known = [str(getattr(label, key)) for label in table.structures]
+        raise DataError(f"{where}: no label {one[key]!r}; {expected(str(one[key]), known)}")
     return {"number": numbers[0]} | {part: one[part] for part in ("opacity", "color") if part in one}

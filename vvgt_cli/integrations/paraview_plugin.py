@@ -17,7 +17,7 @@ from typing import Any
 
 from paraview.util.vtkAlgorithm import VTKPythonAlgorithmBase, smdomain, smproperty, smproxy
 
-ENDINGS = ["html", "spz", "sog", "ply"]  # of a .ply, ParaView takes surfaces for itself
+ENDINGS = ["html", "ply", "spz", "sog", "glb", "usdc", "usdz"]  # of a .ply, ParaView takes surfaces for itself
 ROOT = str(Path(__file__).resolve().parents[2])
 
 sys.path.append(ROOT)  # behind ParaView's own packages, and for these modules alone

@@ -1,4 +1,4 @@
-"""What is kept of a run: the best state that its check views have seen, and all of it in one .npz, to go on from.
+"""`Checks` scores a run and keeps its best state; `save` and `resume` store the run in an .npz.
 
 A run that is resumed gives the bytes of one that was never interrupted, on as many threads.
 """
@@ -52,8 +52,8 @@ class Checks:
     def measure(self, seconds: float, settling: bool = False) -> bool:
         """Score the state, unless that has been done; True if it has fallen, and was put back to the best.
 
-        Rates are kept up in the first half of a run, and pictures may get worse on the way: looks without gain count
-        when it is ``settling``, and after a fall.
+        Rates are kept up in the first half of a run, and pictures may get worse on the way: scores without gain count
+        only when it is ``settling``, and after a fall.
         """
         record = self.record
         if self.check is None or (record.checks and record.checks[-1][0] == record.steps):
@@ -134,7 +134,7 @@ def resume(path: str, key: str, state: State, checks: Checks, record: OptimizeRe
         state.restore(saved)
         best, idle, walk = about["best"], int(about["idle"]), dict(about["walk"])
         described = {field: about["record"][field] for field in asdict(record)}
-        described["checks"] = [tuple(look) for look in described["checks"]]
+        described["checks"] = [tuple(score) for score in described["checks"]]
     except FAULTS as error:
         text = " ".join(str(error).split())[:200]
         raise DataError(f"{path}: not a checkpoint of gradient descent ({text}); remove it to start afresh") from None

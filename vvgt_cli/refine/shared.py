@@ -3,8 +3,8 @@
 A Gaussian's step is Adam's: of its own slopes, view by view, most of which is noise. But what the closed form gets
 wrong it gets wrong alike in Gaussians that are alike: too wide where the opacity is high, too pale beside what is dark.
 So the directions of all are regressed, again at each step, on what is known of each Gaussian at the start, and what the
-regression foretells is added to each one's step, several times over: a mean over thousands has hardly any noise, and
-may go further, as long as what is foretold from step to step agrees. This is descent on the parameters
+regression predicts, times `factor`, is added to each one's step: a mean over thousands has hardly any noise, and may
+go further, as long as predictions agree from step to step. This is descent on the parameters
 ``theta_i + A phi_i`` of Gaussian i, in which A is shared by all. phi are the numbers known and random features of them
 (Rahimi and Recht 2007), so that A phi may bend.
 """

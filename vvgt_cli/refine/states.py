@@ -59,7 +59,7 @@ class State(ABC):
     """What a descent works on, whatever its method and wherever it is.
 
     Attributes:
-        STEADY: what falls far behind its best can be put back there, and a run without gain is at its end.
+        STEADY: whether a fallen score puts the state back to its best, and a run without gain may stop.
     """
 
     STEADY = True
@@ -79,7 +79,7 @@ class State(ABC):
 
     @abstractmethod
     def saved(self) -> dict[str, np.ndarray]:
-        """Return all that the next steps depend on and that the start does not give again; the fields ``array_i``."""
+        """Return the arrays that a resumed run needs; those that descend are ``array_0``, ``array_1`` and so on."""
 
     @abstractmethod
     def restore(self, saved: dict[str, np.ndarray]) -> None:
@@ -159,9 +159,9 @@ class OnHost(State):
 class OwnAxes(OnHost):
     """Covariance ``M M^T``; steps ``mu += M d``, ``M <- M (I + E + E^2 / 2)``, of opacity logits, colours, harmonics.
 
-    Rates go with the root of the running error of the pictures: the nearer, the smaller; and from the middle of the
-    run on in a straight line to zero. Where Gaussians share what their steps have in common (`shared_steps`), or only
-    some are free, of however many, rates count `OWN` times, and slopes that are small beside the others' count less.
+    Rates are proportional to the square root of the running RMS error of the pictures, and from the middle of the run
+    on fall in a straight line to zero. Where Gaussians share what their steps have in common (`shared_steps`), or some
+    are fixed, rates are multiplied by `OWN`, and slopes that are small beside the others' count less.
     Harmonics up to a degree that the start has go by `KNOWN_HARMONICS_RATE` of the rate of those that begin at zero.
     """
 

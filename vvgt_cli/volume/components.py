@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 
 import numpy as np
 
@@ -18,6 +19,12 @@ def listed(items: Sequence[object], between: str = "; ", most: int = LISTED) -> 
     """Join the first ``most`` items for a message, and say where there are more; "none" for none."""
     texts = [printable(str(item)) for item in items[:most]]
     return between.join(texts) + (f"{between}..." if len(items) > most else "") or "none"
+
+
+def expected(asked: str, known: Collection[str], most: int = LISTED) -> str:
+    """Return the end of a message about an unknown name: those of ``known`` that are like it, or else what there is."""
+    near = [] if asked.isdecimal() else get_close_matches(asked, known)
+    return f"did you mean {' or '.join(near)}?" if near else f"expected one of {listed([*known], ', ', most)}"
 
 
 def choose(

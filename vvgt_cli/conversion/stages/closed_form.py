@@ -29,10 +29,10 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class ClosedFormStage(Stage):
-    """The closed form of Gaussians from a volume, without drawing pictures.
+    """The closed form of Gaussians from a volume, without fitting to pictures.
 
     Attributes:
-        recut: a later stage may cut the pyramid again, which checkpoints do not hold: none is written.
+        recut: write no checkpoint: a later stage may cut the pyramid again, which checkpoints lack.
         recut_by_error: a later stage cuts the pyramid by error; a checkpoint is read only where that has been done.
     """
 

@@ -48,7 +48,7 @@ class Format:
 
 
 def _one_of(write_nodes: Callable[[Sequence[Node], str], bytes]) -> Callable[[Splats, str], bytes]:
-    """Return the `Format.write` of a format with nodes: of one, which is the root."""
+    """Return a writer of one cloud, as the root node, from a writer of nodes."""
     return lambda splats, name: write_nodes([Node("", splats)], name)
 
 

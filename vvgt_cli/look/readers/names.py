@@ -11,7 +11,6 @@ and 1. ``viridis``, ``magma:0.2,0.8`` and ``bone:0.3,0.35:0.9`` are examples. ``
 
 from __future__ import annotations
 
-import difflib
 import json
 from functools import cache
 from pathlib import Path
@@ -23,6 +22,7 @@ from vvgt_cli.errors import UsageError
 from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.isosurfaces import PREFIX, isosurfaces
 from vvgt_cli.look.readers import minimal
+from vvgt_cli.volume.components import expected
 
 FILE = Path(__file__).with_name("named.json")
 FORM = "NAME[:LO,HI[:MAX]] with LO, HI and MAX in [0, 1], such as viridis:0.2,0.8:0.5"
@@ -84,10 +84,9 @@ def _colors(name: str) -> np.ndarray:
     from matplotlib import colormaps
 
     if name not in colormaps:
-        close = difflib.get_close_matches(name, [*names(), *colormaps], n=3)
-        hint = f"; did you mean {', '.join(close)}?" if close else ", such as viridis"
         raise UsageError(
-            f"transfer function {name!r}: neither a file, a name of 'vvgt tf list' nor a matplotlib colour map{hint}"
+            f"transfer function {name!r}: neither a file, a name of 'vvgt tf list' nor a matplotlib colour map; "
+            + expected(name, [*names(), *colormaps])
         )
     chosen = colormaps[name]
     return np.asarray(chosen(np.linspace(0, 1, min(max(chosen.N, 2), MAX_NODES))), dtype=np.float64)[:, :3]
