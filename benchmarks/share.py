@@ -18,14 +18,14 @@ from dvr_scenes import print_table, read_scenes, write_rows
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.conversion.gaussian_files import file_rule, layout_of, open_gaussians
-from vvgt_cli.conversion.place import preview, to_box_frame, upright_axes
+from vvgt_cli.conversion.place import to_box_frame, upright_axes
 from vvgt_cli.dvr import Scene
 from vvgt_cli.errors import DataError
 from vvgt_cli.field.source import StyledVolume
 from vvgt_cli.gaussians import Gaussians, in_unit_frame
 from vvgt_cli.gaussians.formats import FORMATS, encoded, read_splats
 from vvgt_cli.gaussians.rules import Rule
-from vvgt_cli.score.views import score_test_views
+from vvgt_cli.score.views import preview, score_test_views
 
 PICTURED, EDGE, QUALITY = 4, 360, 88  # test view from the side, pixels of a picture, of JPEG
 

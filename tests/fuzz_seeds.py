@@ -380,8 +380,8 @@ def checkpoint() -> list[Seed]:
     from test_optimize_checkpoint import CAMERAS, cloud
 
     from vvgt_cli.refine import OptimizeOptions, OptimizeRecord
-    from vvgt_cli.refine.checkpoint import Checks, resume, save
-    from vvgt_cli.refine.loop import begin
+    from vvgt_cli.refine.checkpoint import resume, save
+    from vvgt_cli.refine.loop import Checks, begin
 
     def fresh(method: str) -> tuple[Any, Checks, OptimizeRecord]:
         record, state = OptimizeRecord(), begin(cloud(8), CAMERAS, OptimizeOptions.of(method, max_gaussians=16))
@@ -399,7 +399,7 @@ def checkpoint() -> list[Seed]:
 
 
 def manifest() -> list[Seed]:
-    from vvgt_cli.conversion.manifest import Manifest, read_manifest
+    from vvgt_cli.conversion.manifest import Manifest, read_run_manifest
 
     document = {
         "format": "vvgt-views", "schema": 1, "hash": "ab" * 32, "settings": {"size": 40, "half": False},
@@ -407,7 +407,7 @@ def manifest() -> list[Seed]:
     }  # fmt: skip
 
     def read(path: Path) -> None:
-        read_manifest(path)
+        read_run_manifest(path)
         Manifest(path.parent, {"size": 40}).refresh()
 
     return [Seed("manifest.json", json.dumps(document).encode(), read)]

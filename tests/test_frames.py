@@ -10,7 +10,7 @@ import pytest
 from tests import anatomy
 from tests.random_clouds import random_cloud, turns
 from vvgt_cli.cameras import Camera, default_views
-from vvgt_cli.cameras.boxed import to_box_frame
+from vvgt_cli.cameras.boxed import camera_in_box
 from vvgt_cli.cameras.files import read_cameras, transforms_json
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.gaussians import Gaussians, PlyHeader, in_unit_frame, read_ply
@@ -299,7 +299,7 @@ def test_a_turned_scene_is_seen_by_a_turned_camera(matrix: np.ndarray) -> None:
     cloud = random_cloud(60, 3, 0.05, 0.6, (1, 1.2))
     camera: Camera = replace(default_views("train", size=64)[5], cx=30.0, cy=35.0)
     expected = render(transform(cloud, matrix), camera)
-    inside, mirrored = to_box_frame(camera, matrix)
+    inside, mirrored = camera_in_box(camera, matrix)
     seen = render(cloud, inside)
     assert mirrored == (np.linalg.det(matrix) < 0)
     np.testing.assert_allclose(seen[:, ::-1] if mirrored else seen, expected, atol=2e-4)

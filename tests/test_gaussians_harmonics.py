@@ -9,7 +9,7 @@ import pytest
 
 from tests.refused import refused
 from tests.splat_twin import basis_slopes, view_slopes
-from vvgt_cli.cameras.boxed import to_box_frame
+from vvgt_cli.cameras.boxed import camera_in_box
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.conversion.resume import Checkpoint
 from vvgt_cli.conversion.stages.refinement import without_undrawn
@@ -161,7 +161,7 @@ def test_up_turns_harmonics_with_the_gaussians(up):
 def test_a_scene_seen_in_another_frame_is_the_same_picture(mirrored):
     g, camera = cloud(200, size=0.5), look_at((2.0, -1.7, 1.1), width=48, height=40, fov=40.0)
     matrix = orthogonal(3, mirrored)
-    inside, flipped = to_box_frame(camera, matrix)
+    inside, flipped = camera_in_box(camera, matrix)
     assert flipped == mirrored
     picture = render(g, inside)
     np.testing.assert_allclose(

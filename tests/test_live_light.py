@@ -10,7 +10,7 @@ import pytest
 import vvgt_cli as vvgt_library
 from tests.test_live import GRAIN, HI, LO, RAMP, SMALL, cloud, facts
 from tests.test_page_look import options, page_of
-from vvgt_cli.closed_form.relight import relight
+from vvgt_cli.closed_form.lit import relight
 from vvgt_cli.dvr.light import sphere
 from vvgt_cli.field.field import Resident
 from vvgt_cli.field.source import SourceRequest, load

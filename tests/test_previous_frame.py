@@ -277,7 +277,7 @@ def test_what_frames_leave_to_later_ones_is_in_the_memory_that_is_asked_for(beat
     for k in (0, 1, 2, 0):
         source = SourceRequest(str(beat / f"v_{k}.npy"), tf=str(beat / "tf.json"))
         request = ConvertRequest(source=source, fit=FitOptions(400, 96, steps=100), output=str(beat / f"{k}.ply"))
-        convert_one(replace(request, overwrite=True), start=start)
+        convert_one(replace(request, overwrite=True), warm=start)
     turns = len(start._last.shown)
     assert turns > 3
     pictures = sum(picture.nbytes for _, picture, _ in start._pictures._kept.values())

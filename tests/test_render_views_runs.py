@@ -8,7 +8,7 @@ import pytest
 from tests.processes import replaced
 from tests.view_sets import BASE, SMALL, TF, VOLUME, make_views
 from vvgt_cli import dvr
-from vvgt_cli.conversion.manifest import read_manifest
+from vvgt_cli.conversion.manifest import read_run_manifest
 from vvgt_cli.errors import DataError
 from vvgt_cli.jit.ahead import RAYCAST
 from vvgt_cli.score.record import Run
@@ -154,7 +154,7 @@ def test_a_manifest_that_names_files_outside_is_refused(tmp_path):
             json.dumps({"format": "vvgt-views", "schema": 1, "hash": "", "settings": {}, "files": {name: entry}})
         )
         with pytest.raises(DataError, match="not a manifest"):
-            read_manifest(path)
+            read_run_manifest(path)
 
 
 def test_shards_together_are_the_whole(vvgt, tmp_path, made):

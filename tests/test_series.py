@@ -50,9 +50,9 @@ def stand_in(monkeypatch: pytest.MonkeyPatch) -> list:
     """Write what a frame's function and values come to in place of converting it; returns the calls."""
     calls: list = []
 
-    def write(request, console, finished=None, start=None) -> SimpleNamespace:
+    def write(request, console, finished=None, warm=None) -> SimpleNamespace:
         if request.output is None:
-            return convert_one(request, console, start=start, finished=finished)
+            return convert_one(request, console, warm=warm, finished=finished)
         calls.append(request)
         source = load(request.source)
         text = f"{source.tf.node_range()} {source.statistics.hi:g} {request.fit}"
@@ -195,7 +195,7 @@ def levels(folder: Path) -> dict[str, bytes]:
 
 
 def test_an_interrupted_frame_is_not_recorded(vvgt, series: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(request, console, finished=None, start=None) -> SimpleNamespace:
+    def interrupted(request, console, finished=None, warm=None) -> SimpleNamespace:
         Path(request.output).write_text("short")
         return SimpleNamespace(report=ConversionReport("convert", refinement={"reason": "interrupted"}))
 

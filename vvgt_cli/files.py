@@ -11,10 +11,13 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO
+from typing import IO, TYPE_CHECKING
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.resources import free_memory
+
+if TYPE_CHECKING:
+    import numpy as np
 
 MAX_TEXT = 64 << 20  # bytes; parsed JSON takes some ten times as many
 _CHUNK = 1 << 20
@@ -154,6 +157,17 @@ def atomic_write(path: str | os.PathLike[str], overwrite: bool = False) -> Itera
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
         _leftovers.discard(temporary)
+
+
+def write_arrays(path: str | os.PathLike[str], arrays: np.ndarray | dict[str, np.ndarray]) -> None:
+    """Write an array as .npy, or several by name as .npz, in place of a file at ``path``; errors: `atomic_write`."""
+    import numpy as np
+
+    with atomic_write(path, overwrite=True) as temporary, open(temporary, "wb") as stream:
+        if isinstance(arrays, dict):
+            np.savez(stream, allow_pickle=False, **arrays)
+        else:
+            np.save(stream, arrays, allow_pickle=False)
 
 
 @contextmanager

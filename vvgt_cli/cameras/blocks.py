@@ -9,7 +9,7 @@ import numpy as np
 BLOCK = 16  # pixels along an edge: the tile of the ray caster and the splat renderer
 ENOUGH = 625  # blocks: as many as in a picture of 400 px
 FEW = 250  # blocks that suffice to compare two results, or to find the worst view of one
-GOLDEN = 0.6180339887498949
+GOLDEN = 0.6180339887498949  # multiples of it, modulo 1, are far from each other
 
 
 @dataclass(frozen=True)

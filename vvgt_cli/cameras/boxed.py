@@ -16,7 +16,7 @@ from vvgt_cli.cameras.types import Camera
 _MIRROR = np.array([-1.0, 1.0, 1.0])  # swaps left and right in camera axes
 
 
-def to_box_frame(camera: Camera, axes: np.ndarray) -> tuple[Camera, bool]:
+def camera_in_box(camera: Camera, axes: np.ndarray) -> tuple[Camera, bool]:
     """Return the camera that sees in the box frame what ``camera`` sees in the unit frame.
 
     Args:
@@ -42,7 +42,7 @@ def render_in_box(draw: Callable[[Camera], np.ndarray], axes: np.ndarray) -> Cal
     """Convert a renderer of pictures (h, w, ...) for cameras in the box frame to one for cameras in the unit frame."""
 
     def image(camera: Camera) -> np.ndarray:
-        inside, mirrored = to_box_frame(camera, axes)
+        inside, mirrored = camera_in_box(camera, axes)
         picture = draw(inside)
         return np.ascontiguousarray(picture[:, ::-1]) if mirrored else picture
 

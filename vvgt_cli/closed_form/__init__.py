@@ -115,12 +115,12 @@ def backproject(
     Returns:
         Gaussians, and one line that says what was done.
     """
-    from vvgt_cli.closed_form.closed_form import fit
+    from vvgt_cli.closed_form.closed_form import fit_to_views
     from vvgt_cli.closed_form.fit import solve_colors
 
     if start.form is None:
         return solve_colors(start.gaussians, cameras, views, progress=progress, rule=rule), "colours"
-    return fit(start.form, cameras, views, progress, rule)
+    return fit_to_views(start.form, cameras, views, progress, rule)
 
 
 __all__ = ["METHODS", "Start", "VbmOptions", "backproject", "initialise"]

@@ -39,6 +39,9 @@ CUT_VIEWS = 8
 LARGER_SIZE_WEIGHT = 0.6  # of the error at twice the size, where styles of surface compete
 INSIDE = 0.1  # least transmittance of what other functions may show (0: dark insides; 0.3: surfaces lose 1 dB)
 TWICE_EVERY = 6  # of so many views one counts as seen at twice its size when colours are solved
+MIN_FACTOR, MAX_FACTOR = 0.25, 30.0  # times the mean, for errors at a score: what is flat keeps cells for other views
+UNSEEN = 0.08  # of the mean blending weight in views: Gaussians below are hidden (0.1: fogs lose, 0.05: less gain)
+SHARED = 1.0  # mean scores that the cells above count for: an error of few pixels says little
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -213,7 +216,7 @@ def expected_cells(voxels: float, step: np.ndarray, size: int, budget: int) -> f
     return voxels / float(np.prod(2.0 ** exponents(step, level)))
 
 
-def fit(
+def fit_to_views(
     form: ClosedForm,
     cameras: Sequence[Camera],
     views: np.ndarray,
@@ -261,11 +264,6 @@ def _loss(gaussians: Gaussians, cameras: Sequence[Camera], views: np.ndarray, ru
         total += float(np.mean((render(gaussians, camera, rule) - view)[..., :3] ** 2))
         total += LARGER_SIZE_WEIGHT * float(np.mean((halved - view)[..., :3] ** 2))
     return total / len(cameras)
-
-
-MIN_FACTOR, MAX_FACTOR = 0.25, 30.0  # times the mean, for errors at a score: what is flat keeps cells for other views
-UNSEEN = 0.08  # of the mean blending weight in views: Gaussians below are hidden (0.1: fogs lose, 0.05: less gain)
-SHARED = 1.0  # mean scores that the cells above count for: an error of few pixels says little
 
 
 def scores_by_error(tree: Tree, ids: np.ndarray, errors: np.ndarray, score: np.ndarray) -> np.ndarray:

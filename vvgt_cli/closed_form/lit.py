@@ -15,10 +15,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vvgt_cli.closed_form.columns import COLOR, COLUMNS, FIRST, MASS, RED, SEEN, SEEN_COLOR, SEEN_RED, X, Y, Z
+from vvgt_cli.closed_form.fit import BRIGHTEST
 from vvgt_cli.closed_form.tree import Leaves, Tree
 from vvgt_cli.dvr.kernel import FLAGS, mean_optics, sample, table_coordinate
 from vvgt_cli.dvr.layout import LIT, Light, Optics, Voxels
-from vvgt_cli.dvr.light import sphere
+from vvgt_cli.dvr.light import scene_light, sphere
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.dvr.shading import fixed_diffuse, normal, shade_at
 from vvgt_cli.gaussians import Gaussians
@@ -26,12 +27,13 @@ from vvgt_cli.gaussians.frames import C2, axes_of, basis
 from vvgt_cli.gaussians.types import HARMONICS, SH_C0
 from vvgt_cli.jit.decorators import parallel_kernel
 from vvgt_cli.jit.threads import ThreadSlice, iterations
+from vvgt_cli.look.lighting import Lighting
 
 NORMALS, TINT, FIXED, MEAN, SUMS = slice(1, 7), slice(7, 10), slice(10, 13), slice(13, 16), 16
 SEEN_LITTLE = 1e-12  # of the mass: all of it counts where the cameras see no more
 AROUND = 96  # directions that highlights are projected on
 CHUNK = 1 << 14  # Gaussians whose highlights are projected at once
-BRIGHTEST = 2.0  # as `vvgt_cli.closed_form.fit` has it
+DEGREE = 2  # of the harmonics of Gaussians relit by a light that depends on the view
 
 
 @parallel_kernel("Voxels Voxels Optics f8:1 f8:2 f8:2", LIT, fastmath=FLAGS, error_model="numpy")
@@ -235,6 +237,29 @@ def colored(gaussians: Gaussians, light: Light, out: np.ndarray, degree: int) ->
     return replace(gaussians, colors=np.clip(colors, 0, BRIGHTEST), harmonics=terms if degree else None)
 
 
+def relight(gaussians: Gaussians, axis: np.ndarray, lighting: Lighting) -> Gaussians:
+    """Colour Gaussians under a light that is no sky.
+
+    Args:
+        gaussians: of one colour each.
+        axis: (K, 3) in their frame, as long as the normals agree (`normal_axis` of `gaussian_samples`): that share has
+            a normal along it, the rest normals in all directions; zeros where there are none: ambient light only.
+        lighting: directions in the same frame.
+    """
+    light = scene_light(lighting, np.eye(3), np.ones(3), (1, 1, 1))
+    share = np.linalg.norm(axis.astype(np.float64), axis=1)
+    normals, rest = axis / np.maximum(share, 1e-30)[:, None], np.where(share > 0, 1 - share, 0)
+    sums = np.zeros((len(gaussians), SUMS))
+    sums[:, 0] = 1
+    sums[:, NORMALS] = share[:, None] * normals[:, [0, 0, 0, 1, 1, 2]] * normals[:, [0, 1, 2, 1, 2, 2]]
+    sums[:, TINT] = gaussians.colors
+    lights, mean = len(light.directions) + int(light.head), 1 / (light.power + 1)  # mean of abs(n . h)^power
+    diffuse = share * np.abs(normals @ light.directions.T).sum(axis=1) + rest * lights / 2
+    sums[:, FIXED] = gaussians.colors * (light.ambient + light.diffuse * diffuse)[:, None]
+    sums[:, FIXED] += (light.specular * lights * mean * rest)[:, None]
+    return colored(gaussians, light, sums, DEGREE if lighting.depends_on_view else 0)
+
+
 def even(normals: np.ndarray, power: float, degree: int) -> tuple[np.ndarray, np.ndarray]:
     """Return mean over directions (n,) and coefficients of degree 2 (n, 5) of the mean of abs(n . d)^power.
 
@@ -263,13 +288,13 @@ def highlights(normals: np.ndarray, directions: np.ndarray, power: float, degree
     """
     eyes = sphere(AROUND)  # directions that cameras look along
     projected = np.concatenate([np.full((AROUND, 1), SH_C0), basis(eyes, degree)], axis=1) * (4 * np.pi / AROUND)
-    half = directions[:, None, :] - eyes
-    half /= np.maximum(np.linalg.norm(half, axis=2, keepdims=True), 1e-9)
+    between = directions[:, None, :] - eyes
+    between /= np.maximum(np.linalg.norm(between, axis=2, keepdims=True), 1e-9)
     harmonics = np.zeros((len(normals), 1 + HARMONICS[degree]))
     for start in range(0, len(normals), CHUNK):
         part = slice(start, start + CHUNK)
         main = np.linalg.eigh(normals[part])[1][:, :, 2]
         trace = np.trace(normals[part], axis1=1, axis2=2)
         for k in range(len(directions)):
-            harmonics[part] += trace[:, None] * (np.minimum(np.abs(main @ half[k].T), 1) ** power @ projected)
+            harmonics[part] += trace[:, None] * (np.minimum(np.abs(main @ between[k].T), 1) ** power @ projected)
     return harmonics[:, 0] * SH_C0, harmonics[:, 1:]

@@ -110,7 +110,7 @@ class LoadedVolume:
     ) -> Conversion:
         """Convert; send ``message(conversion)`` before the scores are known, then the scores."""
         conversion = convert_one(
-            request, console, start=self.last, unscored=lambda unscored: console.send(message(unscored))
+            request, console, warm=self.last, unscored=lambda unscored: console.send(message(unscored))
         )
         assert conversion.scores is not None
         console.send(Scored(_file(conversion), conversion.scores["psnr"]))

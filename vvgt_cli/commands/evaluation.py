@@ -21,7 +21,6 @@ from vvgt_cli.conversion.gaussian_files import (
     shown_levels,
 )
 from vvgt_cli.conversion.place import headset_axes, to_box_frame, upright_axes
-from vvgt_cli.conversion.place import preview as side_by_side
 from vvgt_cli.conversion.recolored import apply_function, light_of, looks_of
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.field import Field, Picture
@@ -56,6 +55,7 @@ from vvgt_cli.score.viewing import (
     viewing_conditions,
     zoomed,
 )
+from vvgt_cli.score.views import preview as side_by_side
 from vvgt_cli.score.views import psnr_note, score_test_views, scored_views
 from vvgt_cli.splat.render import Shown
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.cameras import Camera, orbit_views
-from vvgt_cli.cameras.boxed import render_in_box, to_box_frame
+from vvgt_cli.cameras.boxed import camera_in_box, render_in_box
 from vvgt_cli.cameras.files import read_cameras, transforms_json
 from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.commands.view_sets import draw_views
@@ -105,7 +105,7 @@ class Drawing:
             cameras = read_cameras(os.fspath(self.camera), self.size)
         else:
             circle = orbit_views(self.orbit or 1, size=self.size or size or SIZE)
-            cameras = [to_box_frame(camera, upright_matrix(up))[0] for camera in circle]
+            cameras = [camera_in_box(camera, upright_matrix(up))[0] for camera in circle]
         if self.png and len(cameras) > 1 and not is_pattern(self.output):
             raise UsageError(f"-o {self.output}: one picture of {len(cameras)} views; expected a directory")
         cameras *= frames if len(cameras) == 1 else 1

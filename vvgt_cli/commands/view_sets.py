@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vvgt_cli.cameras import Camera, default_views, orbit_views
-from vvgt_cli.cameras.boxed import render_in_box, to_box_frame
+from vvgt_cli.cameras.boxed import camera_in_box, render_in_box
 from vvgt_cli.cameras.files import blender_json, colmap_model, point_cloud_ply, read_frames, transforms_json
 from vvgt_cli.cameras.sets import FIELD_OF_VIEW, RADIUS, SET_VIEWS, SIZE
 from vvgt_cli.conversion.manifest import Manifest, Shard, parse_shard
@@ -533,7 +533,7 @@ def draw_views(field: Field, settings: RenderSettings, cameras: Sequence[Camera]
         nonlocal ahead
         if not ahead:
             ahead = max(TOGETHER // (camera.width * camera.height), 1)
-            field.views.expect([Picture(to_box_frame(other, axes)[0], settings) for other in left[:ahead]])
+            field.views.expect([Picture(camera_in_box(other, axes)[0], settings) for other in left[:ahead]])
             del left[:ahead]
         ahead -= 1
         image = field.views.view(camera, settings)

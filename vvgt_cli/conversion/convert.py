@@ -34,7 +34,7 @@ Unscored = Callable[[Conversion], None]  # is called with a conversion before it
 
 
 def convert_one(
-    request: ConvertRequest, console: Console | None = None, *, start: WarmStart | None = None,
+    request: ConvertRequest, console: Console | None = None, *, warm: WarmStart | None = None,
     finished: Gaussians | None = None, unscored: Unscored | None = None,
 ) -> Conversion:  # fmt: skip
     """Convert a volume to the output of a request, or only in memory where there is none.
@@ -42,7 +42,7 @@ def convert_one(
     Args:
         request: the request.
         console: destination of messages.
-        start: warm start that is tried before the closed form.
+        warm: warm start that is tried before the closed form.
         finished: finished Gaussians, box frame, that only need scores.
         unscored: called with the conversion before it has scores and a certificate.
 
@@ -60,7 +60,7 @@ def convert_one(
         stack.enter_context(claimed(request.outputs(), request.inputs(), request.overwrite))
         stack.enter_context(checkpoint_folder(request.checkpoint))
         field = stack.enter_context(open_field(run, request))
-        conversion = convert_field(run, request, field, start, finished, unscored)
+        conversion = convert_field(run, request, field, warm, finished, unscored)
         if request.checkpoint is not None and not run.report.interrupted:
             Checkpoint(Path(request.checkpoint)).finish()
         if request.output is None:
@@ -70,12 +70,12 @@ def convert_one(
 
 
 def convert_field(
-    run: Run, request: ConvertRequest, field: Field, start: WarmStart | None = None,
+    run: Run, request: ConvertRequest, field: Field, warm: WarmStart | None = None,
     finished: Gaussians | None = None, unscored: Unscored | None = None,
 ) -> Conversion:  # fmt: skip
     """Convert a field: closed form, refinement, file, scores on the test views, certificate; see `convert_one`."""
     work = work_of(run, request, field)
-    scores = fit(work, request, start, finished)
+    scores = fit(work, request, warm, finished)
     gaussians = NOTHING  # where they are only on disk
     if work.gaussians is not None:
         gaussians = to_unit_frame(work.gaussians, field.source.volume)

@@ -208,7 +208,7 @@ def _run(batch: Batch, files: Files | None, console: Console) -> Clouds:
         for item in batch.items(run, lambda stem: files is None or files.wants(batch, stem)):
             alone = replace(item.request, output=None, report=None, preview=None)
             request = alone if files is None else files.request(batch, item)
-            conversion = convert_one(request, run.console, start=batch.previous, finished=item.gaussians)
+            conversion = convert_one(request, run.console, warm=batch.previous, finished=item.gaussians)
             if conversion.report.interrupted:
                 raise KeyboardInterrupt
             facts = {**item.facts, **(batch.previous.facts() if batch.previous else {})}
@@ -277,7 +277,7 @@ def convert_all(
     holds_frames = not output or is_page(output)
     if kind == ONE and not (holds_frames and is_glob_of_volumes(request.source)):
         try:
-            return convert_one(request, console, start=None if after is None else PreviousLook(after))
+            return convert_one(request, console, warm=None if after is None else PreviousLook(after))
         except SeveralSteps:
             if not holds_frames or not isinstance(request.source.volume, str):
                 raise

@@ -19,7 +19,7 @@ from vvgt_cli.errors import DataError, NothingVisible
 from vvgt_cli.field.block_store import COARSE, ROW, RUN, TREES, BlockStore
 from vvgt_cli.field.digests import digest
 from vvgt_cli.field.grid import Boxes, CellGrid
-from vvgt_cli.files import atomic_write
+from vvgt_cli.files import write_arrays
 from vvgt_cli.gaussians import Gaussians, PlyOptions, concatenate
 from vvgt_cli.gaussians.outputs import write_text
 from vvgt_cli.gaussians.ply import as_stored
@@ -31,12 +31,15 @@ if TYPE_CHECKING:
     from vvgt_cli.closed_form.tree import Leaves
     from vvgt_cli.field.blocked import Pass
     from vvgt_cli.field.tiles import TiledPyramid
-    from vvgt_cli.gaussians import Gaussians
     from vvgt_cli.score.record import Run
 
 
 ENOUGH = 1 << 14  # mean Gaussians of a part from which it is not widened
 LARGEST = 1 << 28  # bytes of its voxels while they are read
+PLAN, LIGHT = "plan.json", "light.npz"
+A_SCORE, A_RAY = 20, 20  # bytes of the scores of a base cell and its ancestors, and of a ray within a block
+A_NORMAL = 24  # bytes of the normal of a base cell under a light
+KEPT = 2.2  # Gaussians on disk a Gaussian of the file: with its coarser levels, in the store and in the output
 
 
 class TileGaussians(NamedTuple):
@@ -219,12 +222,6 @@ def cut_of(run: Run, run_pass: Pass) -> Cut:
     return cut
 
 
-PLAN, LIGHT = "plan.json", "light.npz"
-A_SCORE, A_RAY = 20, 20  # bytes of the scores of a base cell and its ancestors, and of a ray within a block
-A_NORMAL = 24  # bytes of the normal of a base cell under a light
-KEPT = 2.2  # Gaussians on disk a Gaussian of the file: with its coarser levels, in the store and in the output
-
-
 @dataclass(frozen=True)
 class CutPlan:
     """The grid of cells, the budget and the layout of the output.
@@ -261,8 +258,7 @@ class CutPlan:
     def save(self, store: BlockStore, light: Light | None) -> None:
         """Write the light, if any, and then the plan beside the blocks."""
         if light is not None:
-            with atomic_write(store.folder / LIGHT, overwrite=True) as temporary, open(temporary, "wb") as stream:
-                np.savez(stream, allow_pickle=False, **light._asdict())
+            write_arrays(store.folder / LIGHT, light._asdict())
         write_text(store.folder / PLAN, json.dumps(plain(asdict(self)), indent=1), overwrite=True)
 
     @classmethod

@@ -64,22 +64,22 @@ def work_of(run: Run, request: ConvertRequest, field: Field) -> Work:
 
 
 def fit(
-    work: Work, request: ConvertRequest, start: WarmStart | None = None, finished: Gaussians | None = None
+    work: Work, request: ConvertRequest, warm: WarmStart | None = None, finished: Gaussians | None = None
 ) -> list[Stage]:
     """Make the Gaussians of ``work``, as they are stored, and return the stages that score them.
 
     Args:
         work: see `work_of`.
         request: the request.
-        start: warm start that is tried before the closed form.
+        warm: warm start that is tried before the closed form.
         finished: finished Gaussians, box frame, that only need scores.
 
     Raises:
         DataError, UsageError: see `vvgt_cli.conversion.convert.convert_one`.
     """
     run, field = work.run, work.field
-    if start is not None:
-        field.renderer = start.renderer(field.views)
+    if warm is not None:
+        field.renderer = warm.renderer(field.views)
     if request.live or not request.scored:
         first, *scores = _unplanned(work, request)
         field.views.expect(_pictures(scores, work.fit))
@@ -92,21 +92,21 @@ def fit(
     if finished is not None:
         plan = plan.for_finished(len(finished), planner.sh_degree)
         run.report.plan = plan.record()
-    elif start is None:
+    elif warm is None:
         field.views.expect(_pictures(plan.stages, work.fit))
-    check_memory(plan, *(() if start is None else start.memory(plan, work.fit)))
+    check_memory(plan, *(() if warm is None else warm.memory(plan, work.fit)))
     work.checkpoint = checkpoint_of(request.checkpoint, field, work.fit)
     if finished is not None:
         work.gaussians = as_stored(finished)
     elif kept := work.checkpoint.load(FITTED):
         work.gaussians = kept[0]
         run.console.message(f"{request.checkpoint} holds the fitted Gaussians: only scoring remains")
-    elif start is None or not start.try_start(work, plan, request):
-        if start is not None:
+    elif warm is None or not warm.try_start(work, plan, request):
+        if warm is not None:
             field.views.expect(_pictures(plan.stages, work.fit))
         whole, plan = plan, _run(work, request, planner, plan)
-        if start is not None:
-            start.keep(work, whole)
+        if warm is not None:
+            warm.keep(work, whole)
     return [stage for stage in plan.stages if stage.scores]
 
 

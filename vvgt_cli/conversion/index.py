@@ -162,7 +162,7 @@ def shown_name(name: str, facts: Mapping[str, Any]) -> str:
     return f"frame {facts['frame']}" if time is None else f"t = {time:g} {facts.get('time_unit', '')}".rstrip()
 
 
-def files_of(path: str | Path) -> list[tuple[str, str]]:
+def indexed_files(path: str | Path) -> list[tuple[str, str]]:
     """List name on a page and file of each cloud of an index; raise DataError as `read_index`, or if one is missing."""
     folder = Path(path).parent
     clouds = [(shown_name(row["name"], row), folder / row["file"]) for row in read_index(path)["files"]]
@@ -176,12 +176,12 @@ def named_files(names: Sequence[str]) -> list[tuple[str, str]]:
 
     Raises:
         UsageError: as `expanded`.
-        DataError: as `files_of`.
+        DataError: as `indexed_files`.
     """
     files: list[tuple[str, str]] = []
     for name in names:
         name = os.path.join(name, MANIFEST) if os.path.isfile(os.path.join(name, MANIFEST)) else name
-        files += files_of(name) if is_index(name) else [(Path(file).name, file) for file in expanded(name)]
+        files += indexed_files(name) if is_index(name) else [(Path(file).name, file) for file in expanded(name)]
     return files
 
 

@@ -38,6 +38,9 @@ from vvgt_cli.volume.stored import planes, values_at
 
 MapLabel = tuple[Volume, LabelTable, Label]  # a label, and its map and table
 Part = tuple[Item, MapLabel | None]  # a label and the request that would convert it alone; or a layer without labels
+DARKENED = 0.1  # difference of colours that counts as much as a label's colour taken for black
+OFFSETS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # standard deviations along each axis at which labels are sampled
+REACH = (1, 2, 4)  # voxels from a Gaussian in no label, within which labels are near
 
 
 def text_of(part: Part) -> str:
@@ -236,11 +239,6 @@ def shares(voxels: Sequence[int], budget: int) -> list[int]:
     weight = np.array(voxels, np.float64) ** (2 / 3)
     weight = np.maximum(weight / weight.sum(), 0.01)
     return [max(int(budget * share), 1) for share in weight / weight.sum()]
-
-
-DARKENED = 0.1  # difference of colours that counts as much as a label's colour taken for black
-OFFSETS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # standard deviations along each axis at which labels are sampled
-REACH = (1, 2, 4)  # voxels from a Gaussian in no label, within which labels are near
 
 
 @dataclass(frozen=True)

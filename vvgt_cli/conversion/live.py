@@ -12,6 +12,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from vvgt_cli.cameras.blocks import GOLDEN
 from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.closed_form import Start
 from vvgt_cli.closed_form.columns import MASS
@@ -48,7 +49,6 @@ BETWEEN = 9  # places around a node where the function that is given may show so
 NODES = 129  # of a function over 256 bins
 HIDDEN_WEIGHT = 0.25  # how much a label of opacity 0 counts, which another table may show
 VOXELS_POWER = 2 / 3  # power of a label's voxels that its cells count less by: small ones are to keep their shape
-GOLDEN = 0.6180339887498949  # labels of neighbouring numbers get codes far from each other
 
 
 def check_live(request: ConvertRequest) -> None:

@@ -98,7 +98,7 @@ class Manifest:
         if overwrite:
             self._clear(manifests)
         for path in [] if overwrite else manifests:
-            document = read_manifest(path, self.what)
+            document = read_run_manifest(path, self.what)
             if document["hash"] != self.hash:
                 raise UsageError(
                     f"{self.folder}: {difference(document['settings'], self.settings, self.what)}; {FRESH}"
@@ -116,7 +116,7 @@ class Manifest:
         """Read what other shards have recorded meanwhile."""
         for path in self._manifests():
             if path.name != self.shard.manifest:
-                self.files |= read_manifest(path, self.what)["files"]
+                self.files |= read_run_manifest(path, self.what)["files"]
 
     def _manifests(self) -> list[Path]:
         if not self.folder.is_dir():
@@ -126,7 +126,7 @@ class Manifest:
     def _clear(self, manifests: list[Path]) -> None:
         for path in manifests:
             try:
-                written = read_manifest(path, self.what)["files"]
+                written = read_run_manifest(path, self.what)["files"]
             except DataError:  # not our manifest: only this file is replaced
                 written = {}
             for name in written:
@@ -153,7 +153,7 @@ class Manifest:
         write_text(self.folder / self.shard.manifest, json.dumps(document, indent=1) + "\n", overwrite=True)
 
 
-def read_manifest(path: Path, what: str = "views") -> dict[str, Any]:
+def read_run_manifest(path: Path, what: str = "views") -> dict[str, Any]:
     """Read the manifest of a folder of ``what`` (a key of `COMMANDS`).
 
     Raise DataError if it is none, or leads outside.

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera, render_in_box
-from vvgt_cli.gaussians import INRIA, Gaussians, PlyOptions, Rule
+from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.frames import rescale, transform, upright_matrix
 from vvgt_cli.gaussians.live import LENGTH
 from vvgt_cli.volume import UnitFrame, Volume
 from vvgt_cli.volume.space import shear_text, world_axis
 
 if TYPE_CHECKING:
-    from vvgt_cli.dvr import Scene, Viewed
     from vvgt_cli.score.viewing import Axes
-    from vvgt_cli.splat.render import Shown
 
 AUTO, NONE = "auto", "none"
 
@@ -100,16 +96,3 @@ def upright_axes(volume: Volume, up: str) -> np.ndarray:
 def headset_axes(volume: Volume, up: str) -> Axes:
     """Return the rows of `upright_axes` with what is up in a viewer along +z; without an ``up`` that is PLY -y."""
     return tuple(map(tuple, upright_axes(volume, "-y" if up == NONE else up).tolist()))
-
-
-def preview(
-    scene: Scene | Viewed, gaussians: Shown, cameras: Sequence[Camera], axes: np.ndarray, rule: str | Rule = INRIA
-) -> np.ndarray:
-    """Draw reference, splats and their difference, one row per camera in the frame of ``axes`` (`upright_axes`)."""
-    from vvgt_cli.dvr import RenderSettings, render_view
-    from vvgt_cli.images import side_by_side
-    from vvgt_cli.splat import render
-
-    reference = render_in_box(lambda camera: render_view(scene, camera, RenderSettings()), axes)
-    ours = render_in_box(lambda camera: render(gaussians, camera, rule), axes)
-    return np.concatenate([side_by_side(reference(camera), ours(camera)) for camera in cameras])

@@ -131,7 +131,7 @@ def recolor_earlier(earlier: Conversion, field: Field) -> Gaussians:
 
 def _look_alone(look: StyledVolume, gaussians: Gaussians, samples: np.ndarray) -> tuple[Gaussians, np.ndarray]:
     """Return Gaussians with the colours of a look at ``samples`` (K, 8), and (K,) extinctions."""
-    from vvgt_cli.closed_form.relight import relight
+    from vvgt_cli.closed_form.lit import relight
 
     sums = function_table(look).of(samples)
     tau = sums[:, TAU]

@@ -85,7 +85,7 @@ def visible_cloud(gaussians: Gaussians, table: Looks, lighting: Lighting | None,
 
 def lit(gaussians: Gaussians, axis: np.ndarray, lighting: Lighting | None) -> Gaussians:
     """Return Gaussians with their colours under a light in their frame; ``axis`` (K, 3) is that of their normals."""
-    from vvgt_cli.closed_form.relight import relight
+    from vvgt_cli.closed_form.lit import relight
 
     return gaussians if lighting is None else relight(gaussians, axis, lighting)
 

@@ -13,7 +13,7 @@ import numpy as np
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.conversion.gaussian_files import write_file
-from vvgt_cli.conversion.place import AUTO, NONE, preview, to_box_frame, up_axis, upright_axes
+from vvgt_cli.conversion.place import AUTO, NONE, to_box_frame, up_axis, upright_axes
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats import SUFFIXES, encoded, format_of
@@ -27,6 +27,7 @@ from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run, StageRecord
 from vvgt_cli.score.viewing import PREVIEW_VIEWS
+from vvgt_cli.score.views import preview
 
 if TYPE_CHECKING:
     from vvgt_cli.field.field import Field

@@ -16,7 +16,7 @@ from vvgt_cli.images.files import read_radiance
 
 ROWS, COLUMNS = 128, 256
 Toward = tuple[float, float, float]  # to the viewer's right, towards the viewer, up
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear red, green and blue, sRGB's primaries
+LUMINANCE = 0.2126, 0.7152, 0.0722  # of linear red, green and blue, sRGB's primaries
 EVERY = 31  # texel is looked at for the brightest side
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from vvgt_cli.closed_form.columns import MOMENTS
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.files import atomic_write
+from vvgt_cli.files import atomic_write, write_arrays
 
 RUN = "run.json"
 COUNTS, HISTOGRAM, LABELS, CELLS = "counts", "histogram", "labels", "cells"
@@ -104,11 +104,7 @@ class BlockStore:
         Raises:
             DataError: the file cannot be written (a full disk).
         """
-        with (
-            atomic_write(self.path(kind, number, suffix), overwrite=True) as temporary,
-            open(temporary, "wb") as stream,
-        ):
-            np.savez(stream, allow_pickle=False, **arrays)
+        write_arrays(self.path(kind, number, suffix), arrays)
 
     def load(
         self, kind: str, number: int, suffix: str = ".npz", names: Collection[str] | None = None

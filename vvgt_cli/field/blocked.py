@@ -24,7 +24,7 @@ from vvgt_cli.field.runners import Runner, Task
 from vvgt_cli.field.settings import cell_grid
 from vvgt_cli.field.source import StyledVolume
 from vvgt_cli.field.workload import PROGRAM, VIEW, Workload, for_budget, pace, view_edge
-from vvgt_cli.files import atomic_write
+from vvgt_cli.files import write_arrays
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.progress import ProgressCallback
 
@@ -282,8 +282,7 @@ class Blocked(Field):
     def _saved(self, rows: np.ndarray, kind: str) -> str:
         """Return the path of a new file of the store with an array."""
         path = self.run_pass.store.folder / f"{kind}.npy"
-        with atomic_write(path, overwrite=True) as temporary, open(temporary, "wb") as stream:
-            np.save(stream, rows)
+        write_arrays(path, rows)
         return str(path)
 
     def sample(self, gaussians: Gaussians) -> np.ndarray:

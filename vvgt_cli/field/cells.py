@@ -13,7 +13,7 @@ from vvgt_cli.field.block_store import CELLS, BlockStore
 from vvgt_cli.field.grid import CellGrid
 from vvgt_cli.field.rays import HALO, RayFile, save_rays
 from vvgt_cli.field.reader import Layers, Scalars, VoxelBox
-from vvgt_cli.files import atomic_write
+from vvgt_cli.files import atomic_write, write_arrays
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr.traced import Scattering
@@ -88,9 +88,7 @@ class CellBlocks(Blockwise):
         if self.rays is not None:
             save_rays(self.rays, box, number, grid.blocks, self.light, store)
         if self.light is not None:
-            path = store.path(CELLS, number, NORMALS)
-            with atomic_write(path, overwrite=True) as temporary, open(temporary, "wb") as stream:
-                np.save(stream, np.concatenate(normals))
+            write_arrays(store.path(CELLS, number, NORMALS), np.concatenate(normals))
         edges = [grid.tile_cells >> grid.march] * 3, [grid.tile_cells >> grid.field] * 3
         store.save(
             CELLS,

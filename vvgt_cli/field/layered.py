@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vvgt_cli.dvr.layers import Layer
+from vvgt_cli.dvr.sky import LUMINANCE
 from vvgt_cli.errors import DataError, SeveralComponents, UsageError
 from vvgt_cli.look import (
     ColorMap,
@@ -35,7 +36,6 @@ if TYPE_CHECKING:
     from vvgt_cli.dvr.scene import PreparedVolume
 
 COLOR, ALL = "color", "all"  # values of --component
-LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
 CHANNEL_COLORS = ((0, 1, 0), (1, 0, 1), (0, 1, 1), (1, 0.5, 0), (0.4, 0.4, 1), (1, 1, 0), (1, 0, 0))
 MAX_CHANNELS = 6  # shown together by default: colours of more are hard to distinguish
 DARK, BRIGHT = 0.5, 0.998  # quantiles of a channel's voxels between which its opacity rises

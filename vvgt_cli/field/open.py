@@ -23,7 +23,8 @@ from vvgt_cli.field.layered import OpenedFile, content_of, open_content
 from vvgt_cli.field.runners import Processes, Runner
 from vvgt_cli.field.settings import BlockOptions, block_bytes, block_edge, worker_count
 from vvgt_cli.field.source import SourceRequest, StyledVolume, describe_source, load
-from vvgt_cli.files import atomic_write
+from vvgt_cli.field.workload import PROGRAM
+from vvgt_cli.files import write_arrays
 from vvgt_cli.gaussians.outputs import STDOUT
 from vvgt_cli.jit.ahead import COUNT_REAL, COUNT_WHOLE, for_blocks
 from vvgt_cli.look.function import TransferFunction
@@ -45,7 +46,7 @@ if TYPE_CHECKING:
 LAYOUT = 9  # version of the stored blocks: increase it whenever their content changes
 MIN_BLOCKED = 1 << 30  # bytes of values: more are processed in blocks, with a tenth of the memory (docs/log/blocks.md)
 LARGE = 0.25  # share of the free memory: smaller files are always read whole
-PROGRAM, CELL_BYTES = 3e8, 300  # bytes: interpreter, libraries and kernels; a base cell in memory
+CELL_BYTES = 300  # of a base cell in memory
 ZARR = {".zarray", ".zgroup", ".zattrs", "zarr.json", "attributes.json"}  # a Zarr or N5 folder has one of these
 INDEXES = (".pvti", ".pvd", ".series", ".xml")  # files that name other files
 PACKED = (
@@ -239,8 +240,7 @@ def _with_body(request: SourceRequest, store: BlockStore) -> SourceRequest:
         return request
     if not path.is_file():
         shown = np.array([~np.isnan(plane) for plane in planes(volumes[0])], np.uint8)
-        with atomic_write(path, overwrite=True) as temporary:
-            np.save(temporary, shown)
+        write_arrays(path, shown)
     return replace(request, read=replace(read, mask=str(path.absolute()), keep_largest=None))
 
 
@@ -298,7 +298,7 @@ def _at_level(read: ReadOptions, path: str, options: BlockOptions, size: int) ->
     return replace(read, level=level), f"level {level} of {len(shapes)} ({sizes}): fine enough for the screen"
 
 
-def files_of(path: str) -> list[Path]:
+def stored_files(path: str) -> list[Path]:
     """Return the slices of a folder or glob, or the file or other folder itself; an empty list if nothing exists."""
     from vvgt_cli.volume.tiff.slices import matching, slices_of
 
@@ -332,11 +332,11 @@ def better_in_blocks(request: SourceRequest) -> bool:
     path, free = request.volume, free_memory()
     if not isinstance(path, str) or path == "-":
         return False
-    inside = not os.path.exists(path) and not files_of(path) and ":/" in path
+    inside = not os.path.exists(path) and not stored_files(path) and ":/" in path
     place = path.rpartition(":/")[0] if inside else path
     zarr = os.path.isdir(place) and ZARR & set(os.listdir(place))
     h5 = os.path.isfile(place) and place.lower().endswith(PACKED)
-    files = files_of(place)
+    files = stored_files(place)
     tiff = files and files[0].suffix.lower() in (".tif", ".tiff")
     index = os.path.isfile(place) and place.lower().endswith(INDEXES)
     away = path.partition(":")[0] in STEPPED
@@ -409,7 +409,7 @@ def _facts(volume: Any) -> list[Any]:
         volumes = content_of(volume).volumes if isinstance(volume, Volume | OpenedFile) else ()
         return [digest(*(one.data for one in volumes)) if volumes else repr(volume)]
     outer = [name for name in (volume, volume.rpartition(":/")[0], volume.partition("#")[0]) if name]
-    files = next((some for name in outer if (some := files_of(name))), [])
+    files = next((some for name in outer if (some := stored_files(name))), [])
     whole = [inner for file in files for inner in (file.rglob("*") if file.is_dir() else (file,))]
     stats = [file.stat() for file in whole]
     return [volume, sum(f.st_size for f in stats), max(f.st_mtime_ns for f in stats)] if stats else [volume]

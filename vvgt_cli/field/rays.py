@@ -21,7 +21,7 @@ from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.digests import digest
 from vvgt_cli.field.grid import Boxes, piece_edge
 from vvgt_cli.field.reader import VoxelBox
-from vvgt_cli.files import atomic_write
+from vvgt_cli.files import write_arrays
 from vvgt_cli.volume.stored import give_back
 
 SUFFIX = ".rays.npy"
@@ -71,8 +71,7 @@ class RayFile:
         name = f"rays-{digest(blocks, *arrays.values())[:16]}"
         path = store.folder / f"{name}.npz"
         if not path.is_file():
-            with atomic_write(path, overwrite=True) as temporary, open(temporary, "wb") as stream:
-                np.savez(stream, allow_pickle=False, **arrays)
+            write_arrays(path, arrays)
         return cls(str(path), name)
 
     def bundles(self) -> list[Bundle]:
@@ -119,8 +118,7 @@ def save_rays(
         for k, seen in _piece_rays(rays, block.part(first - HALO, last + HALO), first, last, blocks.dims, light):
             table.append((piece, k, len(seen)))
             results.append(seen)
-    with atomic_write(store.path(kind, number, SUFFIX), overwrite=True) as temporary, open(temporary, "wb") as stream:
-        np.save(stream, np.concatenate(results) if results else np.empty(0, RAY))
+    write_arrays(store.path(kind, number, SUFFIX), np.concatenate(results) if results else np.empty(0, RAY))
     store.save(kind, number, table=np.array(table, np.int64).reshape(-1, 3))
 
 

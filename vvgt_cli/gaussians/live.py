@@ -2,7 +2,7 @@
 
 Each Gaussian stores the mean value m and standard deviation s of the field under it, the edge L of a cube of the volume
 that it represents, the direction of the mean gradient, with the share r of s that the gradient explains as its length,
-and the axis of the normals, for light (`vvgt_cli.closed_form.relight`). For a function with extinction e and colour c,
+and the axis of the normals, for light (`closed_form.lit.relight`). For a function with extinction e and colour c,
 the values are modelled as a normal distribution N(m, s). Each value covers w = 1 - exp(-e g) of the background over a
 voxel's edge g. The Gaussian's extinction E covers as much as the values do on average; its colour is the mean of c
 weighted by w, minus what neighbours, whose values have a wider spread, will mix in. Weighted by w, z = (v - m) / s has

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vvgt_cli.cameras import FIELD_OF_VIEW, Camera, default_views, look_at, to_box_frame
+from vvgt_cli.cameras import FIELD_OF_VIEW, Camera, camera_in_box, default_views, look_at
 from vvgt_cli.cameras.blocks import ENOUGH, Blocks, picked, spread_blocks
 from vvgt_cli.gaussians.rules import INRIA, RULES, Rule
 from vvgt_cli.gaussians.targets import target_of
@@ -135,7 +135,7 @@ def eye_pictures(
             head = look_at((ring * x, ring * y, UP), width=size, height=size)
             for right in (-APART / 2, APART / 2):
                 eye = replace(head, translation=head.translation - (right, 0, 0))
-                pictures.append((place, to_box_frame(eye, np.array(axes))[0], spread_blocks(size, size, i, enough)))
+                pictures.append((place, camera_in_box(eye, np.array(axes))[0], spread_blocks(size, size, i, enough)))
     return pictures
 
 

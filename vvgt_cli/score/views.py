@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vvgt_cli.cameras import FEW, Blocks, Camera, default_views, drawn_pixels, picked, spread_blocks
+from vvgt_cli.cameras import FEW, Blocks, Camera, default_views, drawn_pixels, picked, render_in_box, spread_blocks
 from vvgt_cli.gaussians import INRIA, Gaussians, Rule
 from vvgt_cli.progress import ProgressCallback
 from vvgt_cli.score.viewing import PREVIEW_VIEWS
@@ -175,3 +175,16 @@ def render_check_views(scene: Scene | Viewed, cameras: Sequence[Camera], setting
         images.append(picked(render_view(scene, camera, settings, blocks), blocks))
         known += [] if blocks is None else [blocks]
     return Views(list(cameras), np.stack(images), known or None)
+
+
+def preview(
+    scene: Scene | Viewed, gaussians: Shown, cameras: Sequence[Camera], axes: np.ndarray, rule: str | Rule = INRIA
+) -> np.ndarray:
+    """Draw reference, splats and their difference, a row per camera, upright by ``axes`` (3, 3) from the box frame."""
+    from vvgt_cli.dvr import RenderSettings, render_view
+    from vvgt_cli.images import side_by_side
+    from vvgt_cli.splat import render
+
+    reference = render_in_box(lambda camera: render_view(scene, camera, RenderSettings()), axes)
+    ours = render_in_box(lambda camera: render(gaussians, camera, rule), axes)
+    return np.concatenate([side_by_side(reference(camera), ours(camera)) for camera in cameras])
