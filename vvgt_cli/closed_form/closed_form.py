@@ -295,8 +295,7 @@ def scores_by_error(tree: Tree, ids: np.ndarray, errors: np.ndarray, score: np.n
         factor[level] = np.where(
             predicted[level] > 0, (wrong[level] / mean + prior * above) / (predicted[level] + prior), above
         )
-    result: np.ndarray = score * np.clip(factor, MIN_FACTOR, MAX_FACTOR)
-    return result
+    return score * np.clip(factor, MIN_FACTOR, MAX_FACTOR)
 
 
 def unseen(weights: np.ndarray, most: int) -> np.ndarray:

@@ -113,8 +113,7 @@ class System:
 
     def scaled(self, gradient: np.ndarray) -> np.ndarray:
         """Return the preconditioned gradient; call `back` first."""
-        result: np.ndarray = gradient / self.weight
-        return result
+        return gradient / self.weight
 
 
 def _descend(system: System, views: np.ndarray, rounds: int, progress: ProgressCallback | None) -> np.ndarray:

@@ -198,8 +198,7 @@ def mean_normals(gaussians: Gaussians, look_up: Callable[[np.ndarray], np.ndarra
 def directions(mean: np.ndarray) -> np.ndarray:
     """Return (n, 3) unit vectors along means of normals; zeros where they cancel out."""
     length = np.linalg.norm(mean, axis=1, keepdims=True)
-    result: np.ndarray = np.where(length > 1e-3, mean / np.where(length > 1e-3, length, 1), 0)
-    return result
+    return np.where(length > 1e-3, mean / np.where(length > 1e-3, length, 1), 0)
 
 
 def _rows(points: np.ndarray) -> np.ndarray:

@@ -42,8 +42,7 @@ class Bells:
 
     def widened(self, soft: float) -> np.ndarray:
         """Return lower triangular factors (K, 3, 3) of the covariances, wider by ``soft`` voxels, in quadrature."""
-        found: np.ndarray = np.linalg.cholesky(self.arms @ self.arms.transpose(0, 2, 1) + soft**2 * np.eye(3))
-        return found
+        return np.linalg.cholesky(self.arms @ self.arms.transpose(0, 2, 1) + soft**2 * np.eye(3))
 
     def sums(
         self, fields: np.ndarray, slopes: np.ndarray, dims: tuple[int, int, int], planes: range, soft: float,

@@ -141,8 +141,7 @@ def _visible(tf: TransferFunction, lo: float, hi: float, least: np.ndarray, most
         marks[max(first - 1, 0) : last + 2] = 1
     before = np.concatenate([[0], marks.cumsum()])
     rows = [np.nan_to_num(np.clip((x - lo) * scale, 0, BINS)).astype(np.int64) for x in (least, most)]
-    result: np.ndarray = before[rows[1] + 1] > before[rows[0]]
-    return result
+    return before[rows[1] + 1] > before[rows[0]]
 
 
 def _slices(volume: Volume, low: int, high: int) -> np.ndarray:
@@ -150,8 +149,7 @@ def _slices(volume: Volume, low: int, high: int) -> np.ndarray:
 
 
 def _data(volume: Volume, stored: np.ndarray) -> np.ndarray:
-    result: np.ndarray = stored * np.float64(volume.slope) + volume.intercept
-    return result
+    return stored * np.float64(volume.slope) + volume.intercept
 
 
 def around(values: np.ndarray, take: np.ufunc) -> np.ndarray:

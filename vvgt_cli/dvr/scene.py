@@ -197,8 +197,7 @@ class KernelRule:
     def apply(self, stored: np.ndarray) -> np.ndarray:
         """Return stored values, any shape and byte order, as kernels read them."""
         if self.raised:
-            raised: np.ndarray = np.ascontiguousarray(stored).view(np.uint8) ^ np.uint8(128)
-            return raised
+            return np.ascontiguousarray(stored).view(np.uint8) ^ np.uint8(128)
         if self.half_width is None:
             return stored.astype(self.dtype, copy=False)
         with np.errstate(invalid="ignore", over="ignore"):

@@ -111,8 +111,7 @@ def _box(x: np.ndarray, y: np.ndarray, z: np.ndarray, toward: Toward, angle: flo
     length = math.sqrt(sum(c * c for c in toward))
     cosine = (x * toward[0] + y * toward[1] + z * toward[2]) / length
     edge = math.cos(math.radians(angle))
-    inside: np.ndarray = np.clip((cosine - edge) / (1 - edge) * 3, 0, 1)
-    return inside
+    return np.clip((cosine - edge) / (1 - edge) * 3, 0, 1)
 
 
 def _colored(*parts: tuple[np.ndarray, tuple[float, float, float]]) -> np.ndarray:

@@ -236,8 +236,7 @@ def _halved(fine: np.ndarray, axis: int, near: float, far: float) -> np.ndarray:
     out[1:] += far * odd[: len(out) - 1]
     if len(odd) == len(out):
         out[-1] += far * odd[-1]
-    moved: np.ndarray = np.moveaxis(out, 0, axis)
-    return moved
+    return np.moveaxis(out, 0, axis)
 
 
 def _doubled(coarse: np.ndarray, axis: int, count: int) -> np.ndarray:
@@ -247,5 +246,4 @@ def _doubled(coarse: np.ndarray, axis: int, count: int) -> np.ndarray:
     out = np.empty((2 * len(coarse), *coarse.shape[1:]))
     out[::2] = 0.75 * coarse + 0.25 * edged[:-2]
     out[1::2] = 0.75 * coarse + 0.25 * edged[2:]
-    moved: np.ndarray = np.moveaxis(out[:count], 0, axis)
-    return moved
+    return np.moveaxis(out[:count], 0, axis)

@@ -114,8 +114,7 @@ def _cropped(scene: Scene) -> np.ndarray:
     which is 0 and 1 half a voxel beyond them: at the planes of the box itself it would leave half a voxel too much.
     """
     count = np.array(scene.values.shape[::-1]) + 2
-    cropped: np.ndarray = scene.half - 0.5 * scene.step * (1 - 2 / count)
-    return cropped
+    return scene.half - 0.5 * scene.step * (1 - 2 / count)
 
 
 def image_data(scene: Scene, padded: bool) -> Any:

@@ -73,8 +73,7 @@ class CellGrid:
     @property
     def cell(self) -> np.ndarray:
         """Edges of a base cell in voxels, (3,)."""
-        result: np.ndarray = 2.0 ** np.array(self.exponent)
-        return result
+        return 2.0 ** np.array(self.exponent)
 
     @property
     def cell_edge(self) -> np.ndarray:

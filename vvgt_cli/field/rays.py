@@ -207,8 +207,7 @@ def meeting(cast: Bundle, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
     x, y = across / ahead / lens[0] + lens[2] - 0.5, down / ahead / lens[1] + lens[3] - 0.5
     column, row = cast.pixels.T
     inside = (column >= x.min() - edge) & (column <= x.max() + edge) & (row >= y.min() - edge) & (row <= y.max() + edge)
-    result: np.ndarray = np.flatnonzero(inside)
-    return result
+    return np.flatnonzero(inside)
 
 
 def composed(

@@ -153,8 +153,7 @@ def rotations(quaternions: np.ndarray) -> np.ndarray:
 
 def axes_of(gaussians: Gaussians) -> np.ndarray:
     """Return the M of covariances ``M M^T``: axes as columns, each a standard deviation long, (K, 3, 3) float64."""
-    scaled: np.ndarray = rotations(gaussians.quaternions) * np.exp(gaussians.log_scales.astype(np.float64))[:, None, :]
-    return scaled
+    return rotations(gaussians.quaternions) * np.exp(gaussians.log_scales.astype(np.float64))[:, None, :]
 
 
 C1 = 0.4886025119029199
@@ -220,8 +219,7 @@ def directions(means: np.ndarray, eye: np.ndarray) -> tuple[np.ndarray, np.ndarr
 def basis(directions: np.ndarray, degree: int) -> np.ndarray:
     """Return the harmonics (K, M) of degree 1 to ``degree`` at unit directions (K, 3)."""
     d = np.asarray(directions, np.float64)
-    harmonics: np.ndarray = np.stack(terms(*d.T), axis=-1)[:, : HARMONICS[degree]]
-    return harmonics
+    return np.stack(terms(*d.T), axis=-1)[:, : HARMONICS[degree]]
 
 
 def view_colors(gaussians: Gaussians, eye: np.ndarray) -> np.ndarray:

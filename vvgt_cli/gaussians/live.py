@@ -122,8 +122,7 @@ class Palette:
 
     def of(self, live: np.ndarray) -> np.ndarray:
         """Return the `sums` (K, 6) for rows of `Gaussians.live`."""
-        found: np.ndarray = self.sums[live[:, LABEL_ROW].astype(np.int64)]
-        return found
+        return self.sums[live[:, LABEL_ROW].astype(np.int64)]
 
 
 @dataclass(frozen=True)
@@ -154,8 +153,7 @@ def law_nodes() -> np.ndarray:
 
 def spreads() -> np.ndarray:
     """Return the standard deviations (SPREADS,) of a table's columns, as shares of the range of values."""
-    found: np.ndarray = WIDEST * (np.arange(SPREADS) / (SPREADS - 1)) ** BEND
-    return found
+    return WIDEST * (np.arange(SPREADS) / (SPREADS - 1)) ** BEND
 
 
 def _samples_of(fine: np.ndarray, nodes: np.ndarray) -> np.ndarray:
@@ -238,8 +236,7 @@ def opacities(mass: np.ndarray, variances: np.ndarray, pixel: float) -> np.ndarr
 def _volumes(gaussians: Gaussians) -> np.ndarray:
     """Return the unit-frame volumes (K,) that Gaussians represent."""
     assert gaussians.live is not None
-    found: np.ndarray = gaussians.live[:, LENGTH].astype(np.float64) ** 3
-    return found
+    return gaussians.live[:, LENGTH].astype(np.float64) ** 3
 
 
 def directions(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:

@@ -65,8 +65,7 @@ def captioned(sheet: np.ndarray, rows: int) -> np.ndarray:
         for k, name in enumerate(names):
             ImageDraw.Draw(line).text(((k + 0.5) * wide, size), name, (255, 255, 255), font, anchor="mm")
         parts += [np.asarray(line, np.float32) / 255, pictures]
-    picture: np.ndarray = np.concatenate(parts)
-    return picture
+    return np.concatenate(parts)
 
 
 def contact_sheet(

@@ -154,8 +154,7 @@ class LabelTable:
 
     def color(self, x: np.ndarray) -> np.ndarray:
         """Return RGB (n, 3) in [0, 1] of labels x (n,)."""
-        result: np.ndarray = self._optics[self._rows(x)[0], :3]
-        return result
+        return self._optics[self._rows(x)[0], :3]
 
     def node_range(self) -> tuple[float, float]:
         """Return the smallest and largest label."""

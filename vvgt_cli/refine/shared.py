@@ -83,8 +83,7 @@ def sampled(numbers: np.ndarray) -> np.ndarray:
     if every == 1:
         return numbers
     runs = numbers[: len(numbers) - len(numbers) % RUN].reshape(-1, RUN, numbers.shape[1])
-    some: np.ndarray = runs[::every].reshape(count, -1)
-    return some
+    return runs[::every].reshape(count, -1)
 
 
 class SharedSteps:

@@ -232,8 +232,7 @@ def fields_backward(
 
 def _scales(gaussians: Gaussians) -> np.ndarray:
     """Return standard deviations (K, 3) float64, none so small or large that dividing by it fails."""
-    result: np.ndarray = np.exp(np.clip(gaussians.log_scales.astype(np.float64), -LARGEST_LOG_SCALE, LARGEST_LOG_SCALE))
-    return result
+    return np.exp(np.clip(gaussians.log_scales.astype(np.float64), -LARGEST_LOG_SCALE, LARGEST_LOG_SCALE))
 
 
 def screen_slopes(projection: Projection, pairs: np.ndarray) -> np.ndarray:

@@ -157,8 +157,7 @@ def _visible(clouds: Sequence[Splats]) -> np.ndarray:
     opacity = np.cumsum(1 / (1 + np.exp(-np.maximum(ordered, -80))))
     first = np.searchsorted(opacity, _FAINT * opacity[-1]) if len(ordered) else 0
     least = np.clip(ordered[first : first + 1], _DRAWN, _SEEN)
-    places: np.ndarray = np.concatenate([splats.means for splats in clouds])[logits >= least] * VIEWER
-    return places
+    return np.concatenate([splats.means for splats in clouds])[logits >= least] * VIEWER
 
 
 def rule_parameters(splats: Splats) -> dict[str, Any]:

@@ -209,8 +209,7 @@ def _pixels(
         if not needed <= size <= 4 * needed + _SPARE + image.width * 64 or (width and image.width != width):
             wide = f"lines of {width}, " if width else ""
             raise DataError(f"{what} is of {image.width} x {image.height} px; expected {wide}{needed} px or a few more")
-        pixels: np.ndarray = np.array(image.convert("RGBA")).reshape(-1, 4)[:needed]
-        return pixels
+        return np.array(image.convert("RGBA")).reshape(-1, 4)[:needed]
 
 
 def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -286,8 +285,7 @@ def codebook(values: np.ndarray) -> np.ndarray:
 def places_in(book: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return the index of the nearest value of a codebook, uint8 in the shape of ``values``."""
     book = book.astype(np.float64)
-    places: np.ndarray = np.searchsorted((book[1:] + book[:-1]) / 2, values).astype(np.uint8)
-    return places
+    return np.searchsorted((book[1:] + book[:-1]) / 2, values).astype(np.uint8)
 
 
 def best_intervals(means: np.ndarray, weights: np.ndarray, count: int) -> np.ndarray:

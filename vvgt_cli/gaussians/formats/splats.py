@@ -114,15 +114,13 @@ def gaussians_of(splats: Splats, name: str) -> tuple[Gaussians, PlyHeader]:
 
 def opacities_of(logits: np.ndarray) -> np.ndarray:
     """Return the opacity (K,) float32 of logits."""
-    result: np.ndarray = (1 / (1 + np.exp(-np.clip(logits.astype(np.float64), -700, 700)))).astype(np.float32)
-    return result
+    return (1 / (1 + np.exp(-np.clip(logits.astype(np.float64), -700, 700)))).astype(np.float32)
 
 
 def logits_of(opacities: np.ndarray) -> np.ndarray:
     """Return the logits (K,) float32 of opacity, which is clipped to 1e-7 and 1 - 1e-7 so that they are finite."""
     some = np.clip(opacities.astype(np.float64), 1e-7, 1 - 1e-7)
-    result: np.ndarray = (np.log(some) - np.log1p(-some)).astype(np.float32)
-    return result
+    return (np.log(some) - np.log1p(-some)).astype(np.float32)
 
 
 def log_scales_of(scales: np.ndarray) -> np.ndarray:
