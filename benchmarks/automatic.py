@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 from scans import angiography, cone_beam, density, head, nuclei, orbital, trunk
 
-from vvgt_cli.cameras.boxed import render_in_box
 from vvgt_cli.cameras.sets import look_at
+from vvgt_cli.cameras.types import render_in_box
 from vvgt_cli.dvr import RenderSettings, Scene, render_view
 from vvgt_cli.images import write_png
 from vvgt_cli.look import from_histogram, read_transfer_function, resolve, unit_distance

@@ -10,9 +10,9 @@ import pytest
 from tests import anatomy
 from tests.random_clouds import random_cloud, turns
 from vvgt_cli.cameras import Camera, default_views
-from vvgt_cli.cameras.boxed import camera_in_box
 from vvgt_cli.cameras.files import read_cameras, transforms_json
 from vvgt_cli.cameras.sets import look_at
+from vvgt_cli.cameras.types import camera_in_box
 from vvgt_cli.gaussians import Gaussians, PlyHeader, in_unit_frame, read_ply
 from vvgt_cli.gaussians.frames import transform
 from vvgt_cli.images.files import read_png

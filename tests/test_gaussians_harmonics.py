@@ -9,8 +9,8 @@ import pytest
 
 from tests.refused import refused
 from tests.splat_twin import basis_slopes, view_slopes
-from vvgt_cli.cameras.boxed import camera_in_box
 from vvgt_cli.cameras.sets import look_at
+from vvgt_cli.cameras.types import camera_in_box
 from vvgt_cli.conversion.resume import Checkpoint
 from vvgt_cli.conversion.stages.refinement import without_undrawn
 from vvgt_cli.errors import DataError, UsageError

@@ -11,7 +11,7 @@ import vvgt_cli as vvgt_library
 from tests.refused import refused
 from tests.test_live import SMALL, cloud
 from tests.test_page_look import options, page_of
-from vvgt_cli.closed_form.labelled import labels_and_gradients
+from vvgt_cli.closed_form.gaussian_samples import labels_and_gradients
 from vvgt_cli.conversion.live import label_fog
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
 from vvgt_cli.gaussians.formats import read_columns

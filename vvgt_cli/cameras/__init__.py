@@ -1,7 +1,6 @@
 """Cameras and view sets."""
 
 from vvgt_cli.cameras.blocks import BLOCK, FEW, Blocks, drawn_pixels, picked, spread_blocks
-from vvgt_cli.cameras.boxed import camera_in_box, render_in_box
 from vvgt_cli.cameras.sets import (
     FIELD_OF_VIEW,
     SET_VIEWS,
@@ -13,7 +12,7 @@ from vvgt_cli.cameras.sets import (
     orbit_views,
     pixel_width,
 )
-from vvgt_cli.cameras.types import Camera
+from vvgt_cli.cameras.types import Camera, camera_in_box, render_in_box
 
 __all__ = ["BLOCK", "FEW", "FIELD_OF_VIEW", "SET_VIEWS", "SIZE", "Blocks", "Camera", "default_views", "drawn_pixels"]
 __all__ += ["farthest_cameras", "fibonacci_views", "look_at", "orbit_views", "picked", "pixel_width", "render_in_box"]

@@ -1,7 +1,8 @@
-"""A volume's values under Gaussians: samples at the points of each."""
+"""A volume's values and labels under Gaussians, and which way they rise: samples at the points of each."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from statistics import NormalDist
 
 import numpy as np
@@ -13,9 +14,13 @@ from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.frames import axes_of, rotations
 from vvgt_cli.jit.decorators import parallel_kernel
 from vvgt_cli.jit.threads import ThreadSlice, iterations
+from vvgt_cli.volume import Volume
+from vvgt_cli.volume.stored import values_at
 
 POINTS = 48  # a Gaussian
 NARROW = 0.7  # standard deviations of the points: where Gaussians overlap the values are the neighbours' too
+WIDE = 1.5  # standard deviations of the points that say where a label ends
+CHUNK = 1 << 14  # Gaussians whose labels are looked up at once
 PRIMES = 2, 3, 5
 NORMAL_SUMS = 7  # of a Gaussian's normals n: n n^T (xx, xy, xz, yy, yz, zz), and how many points there are
 
@@ -115,16 +120,21 @@ def values_of(
         mean = values.sum(axis=1) / count
         differences = np.where(known, values - mean[:, None], 0)
         spread = np.sqrt((differences**2).sum(axis=1) / count)
-    points = offsets()
-    rise = (
-        differences @ points @ np.linalg.inv(points.T @ points) * np.sign(slope)
-    )  # a standard deviation along each axis
-    explained = np.sqrt(((rise @ points.T) ** 2).mean(axis=1)) / np.maximum(spread, 1e-30)
-    axes = rotations(gaussians.quaternions.astype(np.float64))
-    gradient = np.einsum("kij,kj->ki", axes, rise / np.exp(gaussians.log_scales.astype(np.float64)))
+    rise, gradient = _rise(differences * np.sign(slope), gaussians)
+    explained = np.sqrt(((rise @ offsets().T) ** 2).mean(axis=1)) / np.maximum(spread, 1e-30)
     gradient *= (explained.clip(0, 1) / np.maximum(np.linalg.norm(gradient, axis=1), 1e-30))[:, None]
     columns = np.stack([mean * slope + intercept, spread * abs(slope)], axis=1)
     return np.concatenate([columns, normal_axis(sums), gradient], axis=1).astype(np.float32)
+
+
+def _rise(differences: np.ndarray, gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
+    """Fit by least squares how values rise that differ so (K, POINTS) from their mean at `offsets`.
+
+    Return the rise a standard deviation along each axis, and the gradient in the Gaussians' frame, both (K, 3).
+    """
+    points, axes = offsets(), rotations(gaussians.quaternions.astype(np.float64))
+    rise = differences @ points @ np.linalg.inv(points.T @ points)
+    return rise, np.einsum("kij,kj->ki", axes, rise / np.exp(gaussians.log_scales.astype(np.float64)))
 
 
 def normal_axis(sums: np.ndarray) -> np.ndarray:
@@ -140,3 +150,58 @@ def normal_axis(sums: np.ndarray) -> np.ndarray:
     length = along[:, 2] - along[:, :2].mean(axis=1)
     result: np.ndarray = axes[:, :, 2] * length.clip(0, 1)[:, None]
     return result
+
+
+def labels_and_gradients(
+    gaussians: Gaussians, maps: Sequence[tuple[Volume, Sequence[int]]], half: np.ndarray, step: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return rows (K,) int64 of the labels that most points of each Gaussian lie in, -1 for none, and gradients (K, 3).
+
+    Args:
+        gaussians: box frame.
+        maps: label maps on one grid, each with the numbers of its labels, ascending; rows count through all of them.
+        half: (3,) half extents of the grid, unit frame.
+        step: (3,) voxel edges of the grid, unit frame.
+
+    Returns:
+        Rows; and unit vectors of the box frame along which the share of the label rises, by least squares; zeros
+        within a label.
+    """
+    assigned, gradient = np.empty(len(gaussians), np.int64), np.zeros((len(gaussians), 3))
+    for k in range(0, len(gaussians), CHUNK):
+        part = gaussians.take(np.arange(k, min(k + CHUNK, len(gaussians))))
+        assigned[k : k + CHUNK] = _label_assignment(_rows(part, maps, half, step, NARROW))
+        own = (_rows(part, maps, half, step, WIDE) == assigned[None, k : k + CHUNK, None]).any(axis=0)
+        gradient[k : k + CHUNK] = _rise(own - own.mean(axis=1, keepdims=True), part)[1]
+    length = np.linalg.norm(gradient, axis=1, keepdims=True)
+    return assigned, gradient / np.where(length > 1e-9, length, np.inf)
+
+
+def _rows(
+    gaussians: Gaussians, maps: Sequence[tuple[Volume, Sequence[int]]], half: np.ndarray, step: np.ndarray, wide: float
+) -> np.ndarray:
+    """Return (maps, K, points) int64 rows of the labels at points of ``wide`` standard deviations, -1 for none."""
+    centres, arms = in_voxels(gaussians, half, step)
+    points = centres[:, None, :] + np.einsum("kij,mj->kmi", arms, offsets() * (wide / NARROW))
+    index = np.rint(points).astype(np.int64)
+    inside = ((index >= 0) & (index < np.array(maps[0][0].dims))).all(axis=2)
+    rows, first = np.full((len(maps), *inside.shape), -1, np.int64), 0
+    for layer, (volume, numbers) in enumerate(maps):
+        values, known = values_at(volume, index[inside]), np.asarray(numbers, np.float64)
+        at = np.minimum(np.searchsorted(known, values), len(known) - 1)
+        rows[layer][inside] = np.where(known[at] == values, first + at, -1)
+        first += len(known)
+    return rows
+
+
+def _label_assignment(rows: np.ndarray) -> np.ndarray:
+    """Return (K,) the row that comes most often among (maps, K, points), -1 where there is none."""
+    every = np.sort(rows.transpose(1, 0, 2).reshape(rows.shape[1], -1), axis=1)
+    best, most = np.full(len(every), -1, np.int64), np.zeros(len(every), np.int64)
+    run = np.zeros(len(every), np.int64)
+    for m in range(every.shape[1]):
+        same = every[:, m] == every[:, m - 1] if m else np.zeros(len(every), bool)
+        run = np.where(same, run + 1, 1)
+        better = (run > most) & (every[:, m] >= 0)
+        best[better], most[better] = every[better, m], run[better]
+    return best

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.cameras import Camera, orbit_views
-from vvgt_cli.cameras.boxed import camera_in_box, render_in_box
 from vvgt_cli.cameras.files import read_cameras, transforms_json
 from vvgt_cli.cameras.sets import SIZE
+from vvgt_cli.cameras.types import camera_in_box, render_in_box
 from vvgt_cli.commands.view_sets import draw_views
 from vvgt_cli.conversion.frames import FrameSeries, is_glob_of_volumes
 from vvgt_cli.conversion.gaussian_files import file_rule, open_gaussians, shown_levels

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.cameras import Camera, default_views
-from vvgt_cli.cameras.boxed import render_in_box
+from vvgt_cli.cameras.types import render_in_box
 from vvgt_cli.commands.peers import Peer, PeerViews, train
 from vvgt_cli.conversion.convert import convert_one
 from vvgt_cli.conversion.live import live_refusal

@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vvgt_cli.cameras import Camera, default_views, orbit_views
-from vvgt_cli.cameras.boxed import camera_in_box, render_in_box
 from vvgt_cli.cameras.files import blender_json, colmap_model, point_cloud_ply, read_frames, transforms_json
 from vvgt_cli.cameras.sets import FIELD_OF_VIEW, RADIUS, SET_VIEWS, SIZE
+from vvgt_cli.cameras.types import camera_in_box, render_in_box
 from vvgt_cli.conversion.manifest import Manifest, Shard, parse_shard
 from vvgt_cli.conversion.opened import opened_upright, read_once
 from vvgt_cli.errors import DataError, NothingVisible, UsageError

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from vvgt_cli.cameras.blocks import drawn_pixels
 from vvgt_cli.conversion.request import FitOptions
 from vvgt_cli.conversion.voxelize import values_error
 from vvgt_cli.field.digests import LARGEST
@@ -16,7 +17,7 @@ from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.header import Certificate, FileFacts
 from vvgt_cli.score.record import Run
 from vvgt_cli.score.viewing import PREVIEW_VIEWS, ViewingCondition
-from vvgt_cli.score.views import score_test_views, test_view_pixels
+from vvgt_cli.score.views import score_test_views
 from vvgt_cli.splat.render import Shown
 
 WITHIN = 0.1  # dB that the file format may cost
@@ -49,7 +50,7 @@ def with_certificate(
         rule=fit.rule,
         psnr=round(preview_psnr(scores), 2),
         views=len(PREVIEW_VIEWS),
-        pixels=test_view_pixels(fit.screen),
+        pixels=drawn_pixels(fit.screen),
         live_psnr=None if live_psnr is None else round(live_psnr, 2),
         conditions=tuple((condition.name(), round(condition.psnr, 2)) for condition in conditions),
         texture=None if texture["ours"] is None else (round(texture["ours"], 3), round(texture["reference"], 3)),

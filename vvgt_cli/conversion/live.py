@@ -250,7 +250,7 @@ def label_fog_field(field: Field, labels: tuple[Label, ...]) -> Field:
 
 def with_labels(run: Run, field: Field, start: Start, labels: tuple[Label, ...]) -> Gaussians:
     """Return the Gaussians of the fog with the rows of their labels, without those outside all labels."""
-    from vvgt_cli.closed_form.labelled import labels_and_gradients
+    from vvgt_cli.closed_form.gaussian_samples import labels_and_gradients
 
     assert start.leaves is not None
     frame, source = field.source.volume.unit_frame(), field.source

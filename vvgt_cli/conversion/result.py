@@ -16,7 +16,7 @@ from vvgt_cli.conversion.gaussian_files import write_file
 from vvgt_cli.conversion.place import AUTO, NONE, to_box_frame, up_axis, upright_axes
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians, PlyOptions
-from vvgt_cli.gaussians.formats import SUFFIXES, encoded, format_of
+from vvgt_cli.gaussians.formats import PAGE, SUFFIXES, encoded, format_of
 from vvgt_cli.gaussians.formats.page_file import iframe
 from vvgt_cli.gaussians.formats.page_values import PageLayer, Values
 from vvgt_cli.gaussians.formats.streamed import is_streamed
@@ -187,10 +187,8 @@ class Result:
     def _repr_html_(self) -> str | None:
         """Return the viewer page for a notebook; None where a library is missing."""
         name = self.ply.title or "result"
-        page = format_of("x.html")
-        assert page is not None
         try:
-            return iframe(encoded(page, self.gaussians, self.ply, name, self.values()), name)
+            return iframe(encoded(PAGE, self.gaussians, self.ply, name, self.values()), name)
         except DataError:
             return None
 
@@ -240,10 +238,8 @@ class Conversion(Result):
         """Implement `Result.values`."""
         if limit not in self._values:
             with (run or Run(Console(quiet=True), ConversionReport("init"))).stage("values") as stage:
-                page = format_of("x.html")
-                assert page is not None
                 bare = replace(self.gaussians, live=None), replace(self.ply, live=None)
-                room = None if limit is None else limit - CERTIFICATES - len(encoded(page, *bare, ""))
+                room = None if limit is None else limit - CERTIFICATES - len(encoded(PAGE, *bare, ""))
                 found = self._values[limit] = self.field.source.values(room)
                 colours = all(layer.colors for layer in self.field.source.layers)
                 why = (

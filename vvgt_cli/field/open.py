@@ -49,17 +49,8 @@ LARGE = 0.25  # share of the free memory: smaller files are always read whole
 CELL_BYTES = 300  # of a base cell in memory
 ZARR = {".zarray", ".zgroup", ".zattrs", "zarr.json", "attributes.json"}  # a Zarr or N5 folder has one of these
 INDEXES = (".pvti", ".pvd", ".series", ".xml")  # files that name other files
-PACKED = (
-    ".h5",
-    ".hdf5",
-    ".he5",
-    ".hdf",
-    ".nc",
-    ".ims",
-    ".czi",
-    ".nd2",
-    ".vtkhdf",
-)  # compressed: small files may hold many voxels
+# compressed: small files may hold many voxels
+PACKED = (".h5", ".hdf5", ".he5", ".hdf", ".nc", ".ims", ".czi", ".nd2", ".vtkhdf")
 RANGES, LAYER_VOXEL = 0.15, 24  # bytes per voxel: the map of empty space, an optics grid (`dvr.layers.VOXEL_BYTES`)
 OWN = {"uint8": 0, "uint16": 0, "float32": 0, "int8": 1}  # bytes per voxel of the kernels' copy; other types 4
 LAYERED_BYTES = 80  # per voxel of an optics grid while a block is in memory

@@ -23,7 +23,7 @@ import numpy as np
 from vvgt_cli.gaussians.constants import MIN_ALPHA
 from vvgt_cli.gaussians.frames import axes_of, factored
 from vvgt_cli.gaussians.live_facts import AXIS, GRADIENT, LABEL_ROW, LAYER_ID
-from vvgt_cli.gaussians.opacity import mean_opacity, projected_areas
+from vvgt_cli.gaussians.opacity import logits_of, mean_opacity, projected_areas
 from vvgt_cli.gaussians.types import Gaussians
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.labels import Label
@@ -175,7 +175,7 @@ def baked(gaussians: Gaussians, table: Looks, pixel: float = 0.0) -> Gaussians:
     sums = table.of(gaussians.live)
     colors = sums[:, :TAU] / np.maximum(sums[:, TAU, None], 1e-30)
     variances = np.exp(2 * gaussians.log_scales.astype(np.float64))
-    logits = _logits(opacities(without_tails(sums) * _volumes(gaussians), variances, pixel))
+    logits = logits_of(opacities(without_tails(sums) * _volumes(gaussians), variances, pixel), 1 - OPAQUE)
     return replace(gaussians, opacity_logits=logits, colors=colors, harmonics=None)
 
 
@@ -210,7 +210,7 @@ def apply_look(gaussians: Gaussians, table: Looks, pixel: float = 0.0) -> Gaussi
         gaussians.means + np.einsum("kij,kj->ki", axes, along) * (explained * first)[:, None],
         log_scales,
         quaternions,
-        _logits(opacities(tau * _volumes(gaussians), np.exp(2 * log_scales), pixel)),
+        logits_of(opacities(tau * _volumes(gaussians), np.exp(2 * log_scales), pixel), 1 - OPAQUE),
         sums[:, :TAU] / whole[:, None],
     )
 
@@ -257,11 +257,4 @@ def _narrowed(axes: np.ndarray, own: np.ndarray, times: np.ndarray) -> np.ndarra
     """Return axes (K, 3, 3) that are ``times`` (K,) as long along the directions ``own`` (K, 3), see `_within`."""
     arm = np.einsum("kij,kj->ki", axes, own)
     found: np.ndarray = axes + (arm * (times - 1)[:, None])[:, :, None] * own[:, None, :]
-    return found
-
-
-def _logits(opacity: np.ndarray) -> np.ndarray:
-    """Return finite logits of opacities (K,)."""
-    kept = opacity.clip(1 - OPAQUE, OPAQUE)
-    found: np.ndarray = np.log(kept) - np.log1p(-kept)
     return found

@@ -70,3 +70,9 @@ def mean_opacity(li2: np.ndarray, areas: np.ndarray) -> np.ndarray:
     opacity = inverse_dilogarithm(li2)
     result: np.ndarray = np.minimum((opacity * areas).sum(axis=1) / areas.sum(axis=1), MAX_ALPHA)
     return result
+
+
+def logits_of(opacities: np.ndarray, least: float = 1e-7) -> np.ndarray:
+    """Return the finite logits (K,) float32 of opacities, clipped to ``least`` and 1 - ``least``."""
+    some = np.clip(opacities.astype(np.float64), least, 1 - least)
+    return (np.log(some) - np.log1p(-some)).astype(np.float32)

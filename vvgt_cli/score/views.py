@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vvgt_cli.cameras import FEW, Blocks, Camera, default_views, drawn_pixels, picked, render_in_box, spread_blocks
+from vvgt_cli.cameras import FEW, Blocks, Camera, default_views, picked, render_in_box, spread_blocks
 from vvgt_cli.gaussians import INRIA, Gaussians, Rule
 from vvgt_cli.progress import ProgressCallback
 from vvgt_cli.score.viewing import PREVIEW_VIEWS
@@ -30,11 +30,6 @@ def scored_views(size: int, every: bool = True) -> list[tuple[int, Camera, Block
         blocks = spread_blocks(cameras[i].width, cameras[i].height, i)
         views.append((i, cameras[i], None if every and i in PREVIEW_VIEWS else blocks))
     return views
-
-
-def test_view_pixels(size: int) -> int:
-    """Return the number of pixels by which the errors of a test view of ``size`` px are measured."""
-    return drawn_pixels(size)
 
 
 def score_test_views(

@@ -62,6 +62,7 @@ FORMATS = (  # the first whose ending fits is taken: a longer ending stands befo
     Format(".usdz", _one_of(usd.usdz), usd.read_usdz, usd.library, write_nodes=usd.usdz),
     Format(".html", page_look.html, page_file.read_html, gsply_files.gsply, page_file.upright),
 )
+PAGE = FORMATS[-1]
 SUFFIXES = (".ply", *(known.suffix for known in FORMATS))
 _ENDINGS = dict.fromkeys("." + suffix.rpartition(".")[2] for suffix in SUFFIXES)
 ENDINGS = sorted(_ENDINGS, key=".html".__ne__)  # as dialogs for files take them; the page first
@@ -79,7 +80,7 @@ def format_of(path: str | os.PathLike[str]) -> Format | None:
 
 def is_page(output: str | os.PathLike[str] | None) -> bool:
     """Return whether an output is a page, which can hold several clouds."""
-    return (known := format_of(output or "")) is not None and known.suffix == ".html"
+    return format_of(output or "") is PAGE
 
 
 def ready(path: str | Path) -> None:

@@ -26,8 +26,9 @@ from vvgt_cli.gaussians.formats.nodes import (
     placed,
     report_off,
 )
-from vvgt_cli.gaussians.formats.splats import Splats, joined, log_scales_of, logits_of, opacities_of
+from vvgt_cli.gaussians.formats.splats import Splats, joined, log_scales_of, opacities_of
 from vvgt_cli.gaussians.frames import rotations
+from vvgt_cli.gaussians.opacity import logits_of
 from vvgt_cli.gaussians.ply import f_dc_to_colors
 from vvgt_cli.version import VERSION
 

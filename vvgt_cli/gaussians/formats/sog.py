@@ -25,8 +25,9 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.gaussians.formats.splats import DEGREES, Splats, logits_of, morton_order, opacities_of
+from vvgt_cli.gaussians.formats.splats import DEGREES, Splats, morton_order, opacities_of
 from vvgt_cli.gaussians.header import MIP
+from vvgt_cli.gaussians.opacity import logits_of
 from vvgt_cli.gaussians.types import HARMONICS
 from vvgt_cli.version import VERSION
 from vvgt_cli.volume.libraries import library_errors

@@ -11,7 +11,8 @@ from typing import Any, NoReturn
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.gaussians.formats.splats import Splats, logits_of
+from vvgt_cli.gaussians.formats.splats import Splats
+from vvgt_cli.gaussians.opacity import logits_of
 from vvgt_cli.gaussians.ply import colors_to_f_dc
 
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])

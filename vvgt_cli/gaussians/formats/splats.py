@@ -117,12 +117,6 @@ def opacities_of(logits: np.ndarray) -> np.ndarray:
     return (1 / (1 + np.exp(-np.clip(logits.astype(np.float64), -700, 700)))).astype(np.float32)
 
 
-def logits_of(opacities: np.ndarray) -> np.ndarray:
-    """Return the logits (K,) float32 of opacity, which is clipped to 1e-7 and 1 - 1e-7 so that they are finite."""
-    some = np.clip(opacities.astype(np.float64), 1e-7, 1 - 1e-7)
-    return (np.log(some) - np.log1p(-some)).astype(np.float32)
-
-
 def log_scales_of(scales: np.ndarray) -> np.ndarray:
     """Return the natural logarithms (K, 3) float32 of standard deviations, -80 and above so that they are finite."""
     with np.errstate(divide="ignore"):

@@ -18,8 +18,9 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians.formats.nodes import ROOT, Node, common_comments, group_names, offset_in, placed, report_off
-from vvgt_cli.gaussians.formats.splats import DEGREES, Splats, joined, log_scales_of, logits_of, opacities_of
+from vvgt_cli.gaussians.formats.splats import DEGREES, Splats, joined, log_scales_of, opacities_of
 from vvgt_cli.gaussians.header import facts_in
+from vvgt_cli.gaussians.opacity import logits_of
 from vvgt_cli.volume.libraries import library_errors, need
 
 KIND = "ParticleField3DGaussianSplat"
