@@ -380,8 +380,8 @@ def checkpoint() -> list[Seed]:
     from test_optimize_checkpoint import CAMERAS, cloud
 
     from vvgt_cli.refine import OptimizeOptions, OptimizeRecord
-    from vvgt_cli.refine.checkpoint import resume, save
-    from vvgt_cli.refine.loop import Checks, begin
+    from vvgt_cli.refine.checkpoint import Checks, resume, save
+    from vvgt_cli.refine.loop import begin
 
     def fresh(method: str) -> tuple[Any, Checks, OptimizeRecord]:
         record, state = OptimizeRecord(), begin(cloud(8), CAMERAS, OptimizeOptions.of(method, max_gaussians=16))

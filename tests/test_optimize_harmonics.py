@@ -16,8 +16,8 @@ from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.rules import INRIA
 from vvgt_cli.images.metrics import psnr
 from vvgt_cli.refine import METHODS, OptimizeOptions, OptimizeRecord, optimize
-from vvgt_cli.refine.checkpoint import fingerprint, resume, save
-from vvgt_cli.refine.loop import Checks, begin
+from vvgt_cli.refine.checkpoint import Checks, fingerprint, resume, save
+from vvgt_cli.refine.loop import begin
 from vvgt_cli.refine.states import KNOWN_HARMONICS_RATE, SLOPE, Densified, densify
 from vvgt_cli.splat import render
 

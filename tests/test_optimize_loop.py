@@ -14,7 +14,8 @@ from vvgt_cli.gaussians.rules import INRIA
 from vvgt_cli.images.metrics import psnr
 from vvgt_cli.network.prepare import halved
 from vvgt_cli.refine import OptimizeOptions, OptimizeRecord, optimize
-from vvgt_cli.refine.loop import FALLEN, Checks, spread_views
+from vvgt_cli.refine.checkpoint import FALLEN, Checks
+from vvgt_cli.refine.loop import spread_views
 from vvgt_cli.refine.shared import NONE
 from vvgt_cli.refine.states import Fields, OwnAxes
 from vvgt_cli.splat import render

@@ -1,4 +1,4 @@
-"""Checkpoints of gradient descent: `save` stores a run in an .npz, and `resume` goes on from it.
+"""`Checks` scores a run and keeps its best state; `save` and `resume` store the run in an .npz.
 
 A run that is resumed gives the bytes of one that was never interrupted, on as many threads.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import struct
 import zipfile
 from collections.abc import Iterable
@@ -16,14 +17,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vvgt_cli.cameras.blocks import picked
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import write_arrays
-from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.refine.options import OptimizeOptions, OptimizeRecord
+from vvgt_cli.gaussians import INRIA, Gaussians, Rule
+from vvgt_cli.images.metrics import mean_psnr, visible_difference
+from vvgt_cli.refine.options import Check, OptimizeOptions, OptimizeRecord
 
 if TYPE_CHECKING:
-    from vvgt_cli.refine.loop import Checks
     from vvgt_cli.refine.states import State
+
+GAIN = 0.01  # dB: less is none
+FALLEN = 3.0  # dB below the best: rates were too large
 
 FAULTS = (  # that reading a damaged archive raises
     *(OSError, KeyError, ValueError, TypeError, AttributeError, OverflowError, EOFError, MemoryError, RuntimeError),
@@ -31,6 +36,57 @@ FAULTS = (  # that reading a damaged archive raises
 )
 
 STEPPED = 6  # raised when the same start and options step otherwise, or what is kept has other names
+
+
+class Checks:
+    """Checks of a run by its check views, which keeps the best state that they have seen."""
+
+    def __init__(self, state: State, check: Check | None, record: OptimizeRecord, rule: Rule = INRIA) -> None:
+        """Compare ``state`` with the views of ``check``, drawn by ``rule``, and put scores into ``record``."""
+        self.state, self.check, self.record, self.rule = state, check, record, rule
+        self.best: float | None = None
+        self.kept: dict[str, np.ndarray] | None = None  # of what the state has saved, its arrays
+        self.idle = 0
+        self.difference = math.inf  # of the state last scored (`visible_difference`)
+
+    def measure(self, seconds: float, settling: bool = False) -> bool:
+        """Score the state, unless that has been done; True if it has fallen, and was put back to the best.
+
+        Rates are kept up in the first half of a run, and pictures may get worse on the way: scores without gain count
+        only when it is ``settling``, and after a fall.
+        """
+        record = self.record
+        if self.check is None or (record.checks and record.checks[-1][0] == record.steps):
+            return False
+        images = []
+        cameras, views, blocks, weights = (*self.check, None, None)[:4]
+        for i, camera in enumerate(cameras):
+            part = None if blocks is None else blocks[i]
+            images.append(picked(self.state.picture(camera, self.rule, part), part))
+        now, self.difference = mean_psnr(views, images, weights), visible_difference(views, images, weights)
+        record.checks.append((record.steps, seconds, now))
+        fallen = self.best is not None and now < self.best - FALLEN and self.state.STEADY
+        gained = self.best is None or now > self.best + GAIN
+        self.idle = 0 if gained else self.idle + ((settling and self.state.STEADY) or fallen)
+        if self.best is None or now > self.best:
+            self.best, record.kept = now, record.steps
+            self.kept = {k: array.copy() for k, array in self.state.saved().items() if k.startswith("array_")}
+        if fallen:
+            self._put_back()
+        return fallen
+
+    def _put_back(self) -> None:
+        assert self.kept is not None
+        self.state.restore(self.state.saved() | {name: array.copy() for name, array in self.kept.items()})
+
+    def result(self, start: Gaussians) -> Gaussians:
+        """Return the best state as Gaussians; the input itself where nothing was better."""
+        self.record.psnr_after = self.best
+        if self.check is None:
+            self.record.kept = self.record.steps
+        else:
+            self._put_back()
+        return self.state.gaussians() if self.record.kept else start
 
 
 def fingerprint(gaussians: Gaussians, options: OptimizeOptions, *views: Any, others: Iterable[np.ndarray] = ()) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -10,18 +9,14 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from vvgt_cli.cameras import BLOCK, Blocks, Camera
-from vvgt_cli.cameras.blocks import picked
 from vvgt_cli.errors import DataError
-from vvgt_cli.gaussians import INRIA, Gaussians, Rule
-from vvgt_cli.images.metrics import mean_psnr, visible_difference
+from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.progress import ProgressCallback
-from vvgt_cli.refine.checkpoint import fingerprint, resume, save
+from vvgt_cli.refine.checkpoint import Checks, fingerprint, resume, save
 from vvgt_cli.refine.options import Check, OptimizeOptions, OptimizeRecord, Train
 from vvgt_cli.refine.states import Densified, Fields, OnHost, OwnAxes, State
 
 UNSEEN = 12 / 255  # `visible_difference` halfway to an early end that is hardly seen at the end (docs/log/steps.md)
-GAIN = 0.01  # dB: less is none
-FALLEN = 3.0  # dB below the best: rates were too large
 SLOWER = 0.5  # rates after a fall
 SCORES = 8  # on the check views in a run, where that leaves enough steps between two
 SETTLING = 0.5  # share of the run from which on scores without gain count: rates fall only then
@@ -86,57 +81,6 @@ def run(
     result = checks.result(gaussians)
     record.seconds = spent + time.perf_counter() - entered
     return result, record
-
-
-class Checks:
-    """Checks of a run by its check views, which keeps the best state that they have seen."""
-
-    def __init__(self, state: State, check: Check | None, record: OptimizeRecord, rule: Rule = INRIA) -> None:
-        """Compare ``state`` with the views of ``check``, drawn by ``rule``, and put scores into ``record``."""
-        self.state, self.check, self.record, self.rule = state, check, record, rule
-        self.best: float | None = None
-        self.kept: dict[str, np.ndarray] | None = None  # of what the state has saved, its arrays
-        self.idle = 0
-        self.difference = math.inf  # of the state last scored (`visible_difference`)
-
-    def measure(self, seconds: float, settling: bool = False) -> bool:
-        """Score the state, unless that has been done; True if it has fallen, and was put back to the best.
-
-        Rates are kept up in the first half of a run, and pictures may get worse on the way: scores without gain count
-        only when it is ``settling``, and after a fall.
-        """
-        record = self.record
-        if self.check is None or (record.checks and record.checks[-1][0] == record.steps):
-            return False
-        images = []
-        cameras, views, blocks, weights = (*self.check, None, None)[:4]
-        for i, camera in enumerate(cameras):
-            part = None if blocks is None else blocks[i]
-            images.append(picked(self.state.picture(camera, self.rule, part), part))
-        now, self.difference = mean_psnr(views, images, weights), visible_difference(views, images, weights)
-        record.checks.append((record.steps, seconds, now))
-        fallen = self.best is not None and now < self.best - FALLEN and self.state.STEADY
-        gained = self.best is None or now > self.best + GAIN
-        self.idle = 0 if gained else self.idle + ((settling and self.state.STEADY) or fallen)
-        if self.best is None or now > self.best:
-            self.best, record.kept = now, record.steps
-            self.kept = {k: array.copy() for k, array in self.state.saved().items() if k.startswith("array_")}
-        if fallen:
-            self._put_back()
-        return fallen
-
-    def _put_back(self) -> None:
-        assert self.kept is not None
-        self.state.restore(self.state.saved() | {name: array.copy() for name, array in self.kept.items()})
-
-    def result(self, start: Gaussians) -> Gaussians:
-        """Return the best state as Gaussians; the input itself where nothing was better."""
-        self.record.psnr_after = self.best
-        if self.check is None:
-            self.record.kept = self.record.steps
-        else:
-            self._put_back()
-        return self.state.gaussians() if self.record.kept else start
 
 
 @dataclass
