@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from tests.closed_form_scenes import Ramp, Tent, scene_of
-from vvgt_cli.closed_form import linear_ranges as ranges_module
 from vvgt_cli.closed_form import moments as moments_module
 from vvgt_cli.closed_form.moments import Cells, base_cells, exponents
 from vvgt_cli.dvr import Scene
@@ -95,8 +94,8 @@ def test_twin(exponent: tuple[int, int, int], tf, monkeypatch: pytest.MonkeyPatc
     scene = scene_of(rough((19, 9, 13), (1.0, 2.5, 0.7)), tf, 2.0)
     expected = twin(scene, tf, 2.0, np.array(exponent))
     scale = np.abs(expected).max(axis=(0, 1, 2))
-    for bend in (ranges_module.BEND, 0.0):
-        monkeypatch.setattr(ranges_module, "BEND", bend)
+    for bend in (moments_module.BEND, 0.0):
+        monkeypatch.setattr(moments_module, "BEND", bend)
         cells = base_cells(scene, np.array(exponent))
         # the tables interpolate tau linearly between 2048 bins or more
         bound = 5e-3 if bend and min(exponent) >= moments_module.WIDE else 1e-4
@@ -114,7 +113,7 @@ class White(Ramp):
 @pytest.mark.parametrize("exponent", [(1, 1, 1), (3, 2, 1)])
 def test_one_point_gives_what_eight_do_under_a_straight_function(exponent: tuple[int, int, int]) -> None:
     scene = scene_of(rough((19, 9, 13), (1.0, 2.5, 0.7)), White(2.0), 2.0)
-    assert ranges_module.linear_ranges(scene.optics)[0] == scene.optics.bins
+    assert moments_module.linear_ranges(scene.optics)[0] == scene.optics.bins
     expected = twin(scene, White(2.0), 2.0, np.array(exponent))
     off = np.abs(dense(base_cells(scene, np.array(exponent)), expected) - expected).max(axis=(0, 1, 2))
     assert (off / np.abs(expected).max(axis=(0, 1, 2))).max() < 1e-4
@@ -226,13 +225,13 @@ def test_windows_of_bins_are_straight_up_to_a_bend() -> None:
     tau = np.concatenate([np.zeros(5), np.arange(11.0), 10 + 3 * np.arange(1, 7.0), np.full(4, 28.0)])
     nodes = np.stack([tau, 0.5 * tau, 0 * tau, tau], axis=1)
     optics = Optics.of(0.0, 1.0, nodes, np.cumsum(nodes, axis=0))
-    found = ranges_module.linear_ranges(optics)
+    found = moments_module.linear_ranges(optics)
     assert set(found[:5]) == {5}
     assert set(found[5:15]) == {15}
     assert set(found[15:21]) == {21}
     assert set(found[21:25]) == {25}
     bent = optics._replace(nodes=nodes + [[0, 0, 1, 0]] * (np.arange(26) == 9)[:, None])  # a colour's bend, too
-    assert ranges_module.linear_ranges(bent)[5] < 10
+    assert moments_module.linear_ranges(bent)[5] < 10
 
 
 @pytest.mark.parametrize("level", [1, 2])

@@ -204,8 +204,10 @@ def require_cuts_keep_mass(tree: Tree) -> None:
 def compare_levels(scene: Scene) -> Figure:
     """Measure how far the optical mass of cells of two voxels is from that of cells of one."""
     from vvgt_cli.closed_form.closed_form import closed_form
-    from vvgt_cli.closed_form.linear_ranges import BEND  # its mean may be missed by a sixth of that
-    from vvgt_cli.closed_form.moments import base_cells
+    from vvgt_cli.closed_form.moments import (
+        BEND,  # its mean may be missed by a sixth of that
+        base_cells,
+    )
 
     fine, coarse = (base_cells(scene, np.full(3, level)).moments[:, 0].sum() for level in (0, 1))
     form = closed_form(scene, FORM_BUDGET, FORM_SIZE)

@@ -48,6 +48,11 @@ class Opaque:
         """Whether any cell lies inside an opaque body."""
         return self.field.size > 0
 
+    def within(self, points: np.ndarray) -> np.ndarray:
+        """Return points (n, 3), unit frame, in cells from the centre of the first."""
+        places: np.ndarray = (points + self.half) / self.edge - 0.5
+        return places
+
 
 def opaque_field(cells: Cells, step: np.ndarray, half: np.ndarray, labels: bool = False) -> Opaque:
     """Find where the scene, perhaps one of ``labels``, is opaque: empty fields where it is nowhere."""
@@ -137,27 +142,17 @@ def _inwards(smooth: np.ndarray, x: float, y: float, z: float, edge: np.ndarray)
     return gx * scale, gy * scale, gz * scale, norm
 
 
-@parallel_kernel("f4:3 f8:2 f8:1 f8:1 f8:1 f8:3")
+@parallel_kernel("f4:3 f8:2 f8:1 f8:1 f8:3")
 def _flatten(
-    thread: ThreadSlice,
-    smooth: np.ndarray,
-    means: np.ndarray,
-    half: np.ndarray,
-    edge: np.ndarray,
-    by: np.ndarray,
-    cov: np.ndarray,
+    thread: ThreadSlice, smooth: np.ndarray, at: np.ndarray, edge: np.ndarray, by: np.ndarray, cov: np.ndarray
 ) -> None:
-    """Take ``by`` (n,) times n n' off ``cov`` (n, 3, 3), n the normal of a surface at ``means`` (n, 3); else nothing.
+    """Take ``by`` (n,) times n n' off ``cov`` (n, 3, 3), n the normal of a surface ``at`` places (n, 3); else nothing.
 
-    ``smooth``, ``half`` (3,), ``edge`` (3,) of `Opaque`.
+    ``smooth``, ``edge`` (3,) of `Opaque`; places in its cells (`Opaque.within`).
     """
     small = min(edge[0], edge[1], edge[2])
-    for k in iterations(thread, means.shape[0]):
-        x, y, z = (
-            (means[k, 0] + half[0]) / edge[0] - 0.5,
-            (means[k, 1] + half[1]) / edge[1] - 0.5,
-            (means[k, 2] + half[2]) / edge[2] - 0.5,
-        )
+    for k in iterations(thread, at.shape[0]):
+        x, y, z = at[k, 0], at[k, 1], at[k, 2]
         normal = np.empty(3)
         normal[0], normal[1], normal[2], norm = _inwards(smooth, x, y, z, edge)
         if norm * small < FLAT:
@@ -167,25 +162,22 @@ def _flatten(
                 cov[k, i, j] -= by[k] * normal[i] * normal[j]
 
 
-@parallel_kernel("f4:3 f4:3 f8:2 f8:1 f8:1 f8:3 f8:1 f8 f8 f8:2")
+@parallel_kernel("f4:3 f4:3 f8:2 f8:1 f8:3 f8:1 f8 f8 f8:2")
 def _shift(
     thread: ThreadSlice,
-    field: np.ndarray, smooth: np.ndarray, means: np.ndarray, half: np.ndarray, edge: np.ndarray, cov: np.ndarray,
-    reach: np.ndarray, dilation: float, far: float, out: np.ndarray,
+    field: np.ndarray, smooth: np.ndarray, at: np.ndarray, edge: np.ndarray, cov: np.ndarray, reach: np.ndarray,
+    dilation: float, far: float, out: np.ndarray,
 ) -> None:  # fmt: skip
-    """Write `surface_offset` into ``out`` (n, 3): ``field``, ``smooth``, ``half`` (3,), ``edge`` (3,) of `Opaque`.
+    """Write `surface_offset` into ``out`` (n, 3): ``field``, ``smooth``, ``edge`` (3,) of `Opaque`.
 
-    ``means`` (n, 3), ``cov`` (n, 3, 3), ``reach`` (n,) standard deviations, ``dilation``, ``far``: unit frame.
+    Places ``at`` (n, 3) in its cells; ``cov`` (n, 3, 3), ``reach`` (n,) standard deviations, ``dilation``, ``far``:
+    unit frame.
     """
     small = min(edge[0], edge[1], edge[2])
     stride = 0.25 * small
     limit = int(far / stride)
-    for k in iterations(thread, means.shape[0]):
-        x, y, z = (
-            (means[k, 0] + half[0]) / edge[0] - 0.5,
-            (means[k, 1] + half[1]) / edge[1] - 0.5,
-            (means[k, 2] + half[2]) / edge[2] - 0.5,
-        )
+    for k in iterations(thread, at.shape[0]):
+        x, y, z = at[k, 0], at[k, 1], at[k, 2]
         gx, gy, gz, norm = _inwards(smooth, x, y, z, edge)
         if norm * small < FLAT:
             continue
@@ -218,7 +210,7 @@ def flattened(opaque: Opaque, means: np.ndarray, cov: np.ndarray, by: np.ndarray
     the surface's; what is flat by itself keeps its own. They need not be positive.
     """
     out = cov.copy()
-    _flatten(opaque.smooth, means, opaque.half, opaque.edge, by, out)
+    _flatten(opaque.smooth, opaque.within(means), opaque.edge, by, out)
     return out
 
 
@@ -245,5 +237,5 @@ def surface_offset(
     cov = (axes * variances[:, None, :]) @ axes.transpose(0, 2, 1)
     out = np.zeros_like(means)
     far = far + 3 * float(opaque.edge.max())
-    _shift(opaque.field, opaque.smooth, means, opaque.half, opaque.edge, cov, reach, dilation, far, out)
+    _shift(opaque.field, opaque.smooth, opaque.within(means), opaque.edge, cov, reach, dilation, far, out)
     return out

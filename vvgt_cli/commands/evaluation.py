@@ -12,14 +12,7 @@ import numpy as np
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.conversion.certify import rounded_error, verify
-from vvgt_cli.conversion.gaussian_files import (
-    STDIN,
-    file_rule,
-    layout_of,
-    levels_in_box,
-    open_gaussians,
-    shown_levels,
-)
+from vvgt_cli.conversion.gaussian_files import STDIN, file_rule, layout_of, levels_in_box, open_gaussians, shown_levels
 from vvgt_cli.conversion.place import headset_axes, to_box_frame, upright_axes
 from vvgt_cli.conversion.recolored import apply_function, light_of, looks_of
 from vvgt_cli.errors import UsageError

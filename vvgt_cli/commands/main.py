@@ -23,20 +23,8 @@ from vvgt_cli.resources import keep_freed_memory, return_freed_memory
 from vvgt_cli.version import VERSION
 
 COMMANDS = [  # modules of this subpackage, with underscores
-    *(
-        "convert",
-        "init",
-        "merge",
-        "optimize",
-        "recolor",
-        "view",
-        "render",
-        "render-views",
-        "voxelize",
-        "evaluate",
-        "check",
-    ),
-    *("report", "info", "tf", "infer", "export", "train", "synth", "plugin", "warmup"),
+    *("convert", "init", "merge", "optimize", "recolor", "view", "render", "render-views", "voxelize", "evaluate"),
+    *("check", "report", "info", "tf", "infer", "export", "train", "synth", "plugin", "warmup"),
 ]
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 BROKEN_PIPE = 141  # 128 + SIGPIPE

@@ -19,16 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.dvr.kernel import (
-    FLAGS,
-    U,
-    box_span,
-    inverse,
-    mean_optics,
-    sample,
-    table_coordinate,
-    texel_at,
-)
+from vvgt_cli.dvr.kernel import FLAGS, U, box_span, inverse, mean_optics, sample, table_coordinate, texel_at
 from vvgt_cli.dvr.layout import BRICK, BRICK_BITS, LIT_GRID, TUPLES, Optics, Texels, Voxels
 from vvgt_cli.dvr.shading import normal
 from vvgt_cli.dvr.sky import SKY, Sky

@@ -2,15 +2,7 @@
 
 from vvgt_cli.look.function import PER_VOXEL, ColorMap, Named, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.histogram import from_histogram
-from vvgt_cli.look.labels import (
-    AUTO,
-    NO_LABELS,
-    Label,
-    LabelTable,
-    check_labels,
-    hex_color,
-    labels_legend,
-)
+from vvgt_cli.look.labels import AUTO, NO_LABELS, Label, LabelTable, check_labels, hex_color, labels_legend
 from vvgt_cli.look.lighting import MATTE, MAX_LIGHT, NONE, Lighting, LightOptions, parse_lighting
 from vvgt_cli.look.readers import read_transfer_function
 from vvgt_cli.look.resolve import check_visible, resolve, unit_distance

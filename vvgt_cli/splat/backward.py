@@ -41,15 +41,7 @@ from vvgt_cli.splat.buffer import (
     prefetch,
     tile_jit,
 )
-from vvgt_cli.splat.lanes import (
-    CONIC,
-    LANES,
-    SLOPED,
-    TOTALS,
-    load_place,
-    pose_of,
-    slope_lanes,
-)
+from vvgt_cli.splat.lanes import CONIC, LANES, SLOPED, TOTALS, load_place, pose_of, slope_lanes
 
 # alpha dL/dalpha; G = -dalpha/dp dL/dalpha, p the exponent, x dx, dy, dx^2, dx dy, dy^2; weight x dL/d(r, g, b)
 SUMS = 9
