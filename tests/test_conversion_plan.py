@@ -98,17 +98,11 @@ def test_views_are_small_where_gaussians_are_wide(size, edge):
     judged, check_pixels, whole = drawn(size, ENOUGH), drawn(size, FEW), min(size, 300)
     judge, check = (1.2 * 0.05 * pixels / whole**2 for pixels in (judged, check_pixels))
     step = 0.027 * (edge / 400) ** 2 + 0.0275
-    drawn_views = view_count(STEPS, True)
-    seconds = (
-        1
-        + FORM
-        + STEPS * step
-        + drawn_views * (edge / whole) ** 2 * 0.05
-        + 4 * check
-        + ending(judged**0.5, judge, check, size)
-    )
+    count = view_count(STEPS, True)
+    seconds = 1 + FORM + STEPS * step + count * (edge / whole) ** 2 * 0.05 + 4 * check
+    seconds += ending(judged**0.5, judge, check, size)
     assert found.seconds == pytest.approx(seconds)
-    bytes_ = 294e6 + 1240e5 + 32 * (drawn_views * edge**2 + 4 * check_pixels + size**2)
+    bytes_ = 294e6 + 1240e5 + 32 * (count * edge**2 + 4 * check_pixels + size**2)
     assert found.memory == pytest.approx(2e8 + bytes_, rel=1e-3)
     assert of(plan(size=size, time_budget=20.0), Refinement).small
     for other in (plan(size=size, wide=False), plan(size=size, steps=23)):

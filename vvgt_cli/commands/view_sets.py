@@ -180,8 +180,8 @@ def thumbnails(
 
     ``known``: some views' thumbnails, by stem.
     """
-    height = max(_shrunk(view.camera.height, view.camera) for view in views)
-    width = max(_shrunk(view.camera.width, view.camera) for view in views)
+    height = max(view.camera.height // _factor(view.camera) for view in views)
+    width = max(view.camera.width // _factor(view.camera) for view in views)
     tiles = []
     for view in views:
         small = known.get(view.stem)
@@ -197,10 +197,6 @@ def thumbnails(
 
 def _factor(camera: Camera) -> int:
     return min(-(-max(camera.width, camera.height) // THUMBNAIL), camera.width, camera.height)
-
-
-def _shrunk(pixels: int, camera: Camera) -> int:
-    return pixels // _factor(camera)
 
 
 Draw = Callable[[Camera], np.ndarray]

@@ -196,13 +196,11 @@ class Planner:
     def _descent(self, steps: int, small: bool, most: int) -> list[Stage]:
         """Return gradient descent with its views, and cells by error unless steps are few or a network runs."""
         enough = steps >= ENOUGH_STEPS and self.fit.init == "moments"  # else no pyramid can be cut again
-        early = early_end(self.fit)
-        early = None if early is None or early >= steps else early
         return [
             CheckViews(),
             TrainingViews(view_count(steps, small), view_edge(self.fit.screen, small)),
             *([CellsByError(small, keep=not self._recuts())] if enough and self.fit.model is None else []),
-            Refinement(steps, most, small, early, overlap=enough),
+            Refinement(steps, most, small, early_end(self.fit, steps), overlap=enough),
         ]
 
     def _recuts(self) -> bool:

@@ -388,7 +388,8 @@ class Densified(Fields):
         score = self.slopes / np.maximum(self.seen, 1)
         denser, origin = densify(self.gaussians(), score, self.limit, self.extent, self.rng)
         self.arrays = tuple(denser.arrays().values())
-        self.running = [np.where(_wide(origin >= 0, moment), moment[origin], 0) for moment in self.running]
+        old = origin >= 0
+        self.running = [np.where(old.reshape(-1, *(1,) * (m.ndim - 1)), m[origin], 0) for m in self.running]
         self._forget()
 
     def _reset(self) -> None:
@@ -435,7 +436,3 @@ def densify(
         shared = -np.expm1(0.5 * np.log1p(-np.minimum(opacity[chosen[~large]], 1 - 1e-6)))
         logits[rows[~large]] = np.log(shared / (1 - shared))
     return replace(g.take(index), means=means, log_scales=logs, opacity_logits=logits), origin
-
-
-def _wide(mask: np.ndarray, like: np.ndarray) -> np.ndarray:
-    return mask.reshape(-1, *(1,) * (like.ndim - 1))

@@ -46,12 +46,12 @@ def most_steps(fit: FitOptions) -> int:
     return MAX_STEPS if fit.ended else STEPS
 
 
-def early_end(fit: FitOptions) -> int | None:
-    """Return the steps after which descent may end since nobody sees a difference; None where the user decides.
+def early_end(fit: FitOptions, steps: int = EARLY + 1) -> int | None:
+    """Return after which of ``steps`` descent may end since nobody sees a difference; None where the user decides.
 
     A network uses all views, so that it ends none early.
     """
-    return None if fit.steps is not None or fit.model is not None or fit.ended else EARLY
+    return None if fit.steps is not None or fit.model is not None or fit.ended or steps <= EARLY else EARLY
 
 
 def steps_in_time(steps: int, left: float | None, seconds: Callable[[int], float]) -> int:

@@ -131,8 +131,7 @@ def sampled_volume(
     if dims is None:
         edges = " x ".join(f"{edge:.6g}" for edge in grid.spacing)
         warnings.warn(
-            f"{source}: resampled to {size} voxels of {edges}, by its cells (--dims X Y Z decides)",
-            stacklevel=2,
+            f"{source}: resampled to {size} voxels of {edges}, by its cells (--dims X Y Z decides)", stacklevel=2
         )
     label = f"{name} (resampled to {size})"
     return Volume(values.astype(float_dtype(dtype)), grid.spacing, grid.origin, name=label)
