@@ -46,7 +46,7 @@ def most_steps(fit: FitOptions) -> int:
     return MAX_STEPS if fit.ended else STEPS
 
 
-def early_end(fit: FitOptions, steps: int = EARLY + 1) -> int | None:
+def early_end(fit: FitOptions, steps: float = float("inf")) -> int | None:
     """Return after which of ``steps`` descent may end since nobody sees a difference; None where the user decides.
 
     A network uses all views, so that it ends none early.
