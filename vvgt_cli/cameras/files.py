@@ -267,5 +267,4 @@ def point_cloud_ply(points: np.ndarray, colors: np.ndarray) -> bytes:
 
 
 def _bytes(colors: np.ndarray) -> np.ndarray:
-    result: np.ndarray = np.rint(np.clip(colors, 0, 1) * 255).astype(np.uint8)
-    return result
+    return np.rint(np.clip(colors, 0, 1) * 255).astype(np.uint8)

@@ -54,8 +54,7 @@ class Camera:
     @property
     def position(self) -> np.ndarray:
         """Centre of projection in the unit frame, (3,)."""
-        result: np.ndarray = -self.rotation.T @ self.translation
-        return result
+        return -self.rotation.T @ self.translation
 
     def middle(self, edge: int) -> Camera:
         """Return the middle of the picture of the same view, ``edge`` pixels wide and high."""
@@ -90,8 +89,7 @@ def quaternions(rotations: np.ndarray) -> np.ndarray:
 def quaternion(rotation: np.ndarray) -> np.ndarray:
     """Return the unit quaternion (4,) with w >= 0 of a matrix (3, 3)."""
     unsigned = quaternions(np.asarray(rotation, np.float64)[None])[0]
-    result: np.ndarray = unsigned * np.copysign(1.0, unsigned[0])
-    return result
+    return unsigned * np.copysign(1.0, unsigned[0])
 
 
 def camera_in_box(camera: Camera, axes: np.ndarray) -> tuple[Camera, bool]:

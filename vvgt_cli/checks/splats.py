@@ -28,8 +28,7 @@ ROUNDING = 2.0**-25  # largest relative rounding of float32
 def finite_rows(columns: Splats) -> np.ndarray:
     """Return which rows have only finite numbers and a rotation that is not 0, (K,) bool."""
     rows = [np.isfinite(getattr(columns, name)).reshape(len(columns), -1).all(axis=1) for name in COLUMNS.values()]
-    result: np.ndarray = np.logical_and.reduce(rows)
-    return result
+    return np.logical_and.reduce(rows)
 
 
 def row_cases(columns: Splats, good: np.ndarray) -> Iterator[Case]:

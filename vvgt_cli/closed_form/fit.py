@@ -208,14 +208,12 @@ class ViewDependentSystem(System):
     def pull(self, change: np.ndarray) -> np.ndarray:
         """Implement `System.pull`."""
         assert self.prior is not None
-        result: np.ndarray = self.prior * change
-        return result
+        return self.prior * change
 
     def scaled(self, gradient: np.ndarray) -> np.ndarray:
         """Return the gradient times the inverse of each Gaussian's own matrix."""
         assert self.inverse is not None
-        result: np.ndarray = np.matmul(self.inverse, gradient.astype(np.float32)).astype(np.float64)
-        return result
+        return np.matmul(self.inverse, gradient.astype(np.float32)).astype(np.float64)
 
     def gaussians(self, unknowns: np.ndarray, brightest: float) -> Gaussians:
         """Return Gaussians with colours in [0, ``brightest``], and harmonics that nowhere change them by more."""

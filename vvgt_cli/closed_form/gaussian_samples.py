@@ -148,8 +148,7 @@ def normal_axis(sums: np.ndarray) -> np.ndarray:
     mean = sums[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3) / np.maximum(sums[:, 6], 1)[:, None, None]
     along, axes = np.linalg.eigh(mean)
     length = along[:, 2] - along[:, :2].mean(axis=1)
-    result: np.ndarray = axes[:, :, 2] * length.clip(0, 1)[:, None]
-    return result
+    return axes[:, :, 2] * length.clip(0, 1)[:, None]
 
 
 def labels_and_gradients(

@@ -164,8 +164,7 @@ class Shading:
 
 def centroids(moments: np.ndarray) -> np.ndarray:
     """Return centroids (n, 3) of rows of moments, box frame."""
-    result: np.ndarray = moments[:, FIRST] / moments[:, [MASS]]
-    return result
+    return moments[:, FIRST] / moments[:, [MASS]]
 
 
 def at_points(scene: Scene, points: np.ndarray) -> np.ndarray:

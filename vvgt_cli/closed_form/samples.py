@@ -54,8 +54,7 @@ def visible_share(tables: Optics, values: np.ndarray) -> np.ndarray:
             low = np.minimum(np.take(low, range(n - 1), axis), np.take(low, range(1, n), axis))
             high = np.maximum(np.take(high, range(n - 1), axis), np.take(high, range(1, n), axis))
     visible = positive[np.ceil(high).astype(np.int64) + 1] > positive[np.floor(low).astype(np.int64)]
-    result: np.ndarray = visible.mean(axis=(1, 2, 3))
-    return result
+    return visible.mean(axis=(1, 2, 3))
 
 
 def estimate(shares: np.ndarray, weights: np.ndarray, voxels: int) -> float:

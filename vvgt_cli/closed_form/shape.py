@@ -130,5 +130,4 @@ def quaternions(axes: np.ndarray) -> np.ndarray:
         axis=1,
     )  # (n, 4 candidates, 4): each row is the quaternion times four times its own component
     best = rows[np.arange(len(m)), squares.argmax(axis=1)]
-    result: np.ndarray = best / np.linalg.norm(best, axis=1, keepdims=True)
-    return result
+    return best / np.linalg.norm(best, axis=1, keepdims=True)

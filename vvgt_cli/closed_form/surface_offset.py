@@ -50,8 +50,7 @@ class Opaque:
 
     def within(self, points: np.ndarray) -> np.ndarray:
         """Return points (n, 3), unit frame, in cells from the centre of the first."""
-        places: np.ndarray = (points + self.half) / self.edge - 0.5
-        return places
+        return (points + self.half) / self.edge - 0.5
 
 
 def opaque_field(cells: Cells, step: np.ndarray, half: np.ndarray, labels: bool = False) -> Opaque:
@@ -74,8 +73,7 @@ def nowhere(edge: np.ndarray, half: np.ndarray) -> Opaque:
 
 def opaque_depth(mass: np.ndarray, edge: np.ndarray, step: np.ndarray) -> np.ndarray:
     """Return (n,) opacity of cells of ``mass`` (n,), 1 and more where opaque; edges of cell and voxel (3,)."""
-    result: np.ndarray = mass / edge.prod() * (float(step.mean()) / OPAQUE_DEPTH)
-    return result
+    return mass / edge.prod() * (float(step.mean()) / OPAQUE_DEPTH)
 
 
 def covered(depth: np.ndarray, labels: bool) -> np.ndarray:

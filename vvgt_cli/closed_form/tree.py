@@ -55,8 +55,7 @@ class Tree:
     @property
     def edge(self) -> np.ndarray:
         """(n, 3) float64 cell edges, unit-frame lengths."""
-        result: np.ndarray = self.edges[self.level]
-        return result
+        return self.edges[self.level]
 
     @property
     def levels(self) -> list[slice]:
@@ -182,8 +181,7 @@ class Scores(NamedTuple):
 
     def leaves(self, threshold: float) -> np.ndarray:
         """Return which cells (n,) are leaves where all with a score above the threshold are split."""
-        leaves: np.ndarray = (self.above > threshold) & ((self.capped <= threshold) | ~self.inner)
-        return leaves
+        return (self.above > threshold) & ((self.capped <= threshold) | ~self.inner)
 
 
 def select(tree: Tree, budget: int, score: np.ndarray | None = None) -> np.ndarray:
@@ -223,8 +221,7 @@ def threshold_for(scores: Callable[[], Iterable[Scores]], budget: int) -> float:
 def _bins(scores: np.ndarray) -> np.ndarray:
     """Return the histogram bin of each score; bins ascend with scores."""
     bits = np.ascontiguousarray(scores).view(np.int64) >> (52 - FRACTION_BITS)
-    result: np.ndarray = np.clip(bits - LOWEST, 0, BINS - 1)
-    return result
+    return np.clip(bits - LOWEST, 0, BINS - 1)
 
 
 def cap_by_ancestors(tree: Tree, score: np.ndarray) -> np.ndarray:

@@ -164,14 +164,12 @@ def _mean_extinction(cells: Cells, scene: Scene | BoxFrame, wider: int) -> np.nd
     edge = 2.0 ** (cells.exponent + wider)
     shape = np.ceil(voxels_of(scene) / edge).astype(np.int64)
     mass = summed(cells.index, cells.moments[:, MASS], wider, shape)
-    result: np.ndarray = (mass / (edge * scene.step).prod()).astype(np.float32)
-    return result
+    return (mass / (edge * scene.step).prod()).astype(np.float32)
 
 
 def voxels_of(box: Scene | BoxFrame) -> np.ndarray:
     """Return the voxels (3,) along x, y, z of a box."""
-    result: np.ndarray = np.round(2 * np.asarray(box.half) / np.asarray(box.step))
-    return result
+    return np.round(2 * np.asarray(box.half) / np.asarray(box.step))
 
 
 @kernel("i4:2 f8:1 i8 f8:3")
@@ -214,8 +212,7 @@ def widening(dims: np.ndarray, exponent: np.ndarray, step: np.ndarray, cameras: 
     wider = 0
 
     def edge() -> np.ndarray:
-        result: np.ndarray = np.minimum(2.0 ** (exponent + wider), dims)
-        return result
+        return np.minimum(2.0 ** (exponent + wider), dims)
 
     while np.ceil(dims / edge()).prod() > MAX_CELLS or (
         _rays_a_cell(edge() * step, cameras) < MIN_RAYS and (edge() < dims).any()

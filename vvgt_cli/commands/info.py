@@ -46,8 +46,7 @@ def info(
     name, shown, read = os.fspath(file), live_look(Look.of(look)), source_of(file, None, reading).read
     if sharing and (shown, read) != (None, ReadOptions()):
         raise UsageError("--sharing describes the file as it is; omit --tf and reading options")
-    facts: dict[str, Any] = plain(what_leaves(name) if sharing else inspect(name, read, shown))
-    return facts
+    return plain(what_leaves(name) if sharing else inspect(name, read, shown))
 
 
 @shared.command("info", short_help="Describe a volume, transfer function, view set or .ply.")

@@ -116,8 +116,7 @@ def page_files(gaussians: Gaussians, options: PlyOptions, title: str, values: Va
 def corners(look: Mapping[str, Any]) -> list[list[float]]:
     """Return the corners of the volume's box in the viewer's axes."""
     ends = np.array(list(product(*np.transpose(look["box"]))))
-    places: list[list[float]] = (ends @ np.array(look["axes"])).round(3).tolist()
-    return places
+    return (ends @ np.array(look["axes"])).round(3).tolist()
 
 
 class PageController:

@@ -46,8 +46,7 @@ class LazyGroup(click.Group):
         """Import and return a command, None if there is none of this name."""
         if cmd_name not in COMMANDS:
             return None
-        result: click.Command = importlib.import_module(f"vvgt_cli.commands.{cmd_name.replace('-', '_')}").command
-        return result
+        return importlib.import_module(f"vvgt_cli.commands.{cmd_name.replace('-', '_')}").command
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]

@@ -384,8 +384,7 @@ def _greatest(source: StyledVolume, parts: Iterable[Part], camera: Camera) -> np
     for box, lo, hi in parts:
         faces = np.stack([np.where(lo == 0, -np.inf, lo - 0.5), np.where(hi == dims, np.inf, hi - 0.5), dims])
         greatest(box.voxels, box.optics, faces, box.begin.astype(np.float64), *rays, MIP_STEP, out)
-    mean: np.ndarray = out.reshape(camera.height, n, camera.width, n).mean(axis=(1, 3))
-    return mean
+    return out.reshape(camera.height, n, camera.width, n).mean(axis=(1, 3))
 
 
 def _of_range(statistics: Statistics, slope: float, intercept: float) -> Optics:

@@ -169,8 +169,7 @@ def thumbnail(image: np.ndarray, camera: Camera) -> np.ndarray:
     """Return a camera's ``image`` (h, w, 4) float32, averaged down to at most `THUMBNAIL` pixels a side."""
     factor = _factor(camera)
     h, w = image.shape[0] // factor, image.shape[1] // factor
-    small: np.ndarray = image[: h * factor, : w * factor].reshape(h, factor, w, factor, 4).mean(axis=(1, 3))
-    return small
+    return image[: h * factor, : w * factor].reshape(h, factor, w, factor, 4).mean(axis=(1, 3))
 
 
 def thumbnails(

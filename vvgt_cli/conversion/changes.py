@@ -109,8 +109,7 @@ def _differ(old: Layer, new: Layer, source: StyledVolume, low: int, high: int) -
     if new.colors is not None:
         assert old.colors is not None
         pairs = zip((old.volume, *old.colors), (new.volume, *new.colors), strict=True)
-        any_band: np.ndarray = np.any([_slices(a, low, high) != _slices(b, low, high) for a, b in pairs], axis=0)
-        return any_band
+        return np.any([_slices(a, low, high) != _slices(b, low, high) for a, b in pairs], axis=0)
     first, second = (_slices(volume, low, high) for volume in (old.volume, new.volume))
     changed: np.ndarray
     if source.gridded or not isinstance(new.tf, TransferFunction):  # optics at voxels

@@ -260,8 +260,7 @@ class HiddenCells:
         """Return (K,) bool, whether the centre of each Gaussian is hidden."""
         voxels = (gaussians.means.astype(np.float64) + self.half) / self.step
         i, j, k = (self._along(axis, voxels[:, axis]) for axis in range(3))
-        hidden: np.ndarray = self.cells[k, j, i]
-        return hidden
+        return self.cells[k, j, i]
 
     def meet_label(self, volume: Volume, number: int) -> bool:
         """Return whether part of a label's surface, where it meets other labels or the box, is hidden."""
@@ -286,8 +285,7 @@ class HiddenCells:
     def _along(self, axis: int, voxels: np.ndarray) -> np.ndarray:
         """Return (n,) int64, the cell along an axis of positions in voxels from the box's corner."""
         n = self.cells.shape[2 - axis]
-        cells: np.ndarray = np.clip(np.floor(voxels / self.edge[axis]), 0, n - 1).astype(np.int64)
-        return cells
+        return np.clip(np.floor(voxels / self.edge[axis]), 0, n - 1).astype(np.int64)
 
 
 def assign_labels(gaussians: Gaussians, shown: Sequence[tuple[Volume, LabelTable, Label]]) -> np.ndarray:
@@ -328,8 +326,7 @@ def _near(index: np.ndarray, weights: np.ndarray, shown: Sequence[tuple[Volume, 
         around = (index[rows][:, None] + shifts).reshape(-1, 3)  # in one pass over a map that stays in its file
         _vote(around, weights, shown, votes, np.repeat(np.arange(len(rows)), len(shifts)))
         nearby[rows] = votes
-    near: np.ndarray = (nearby > 0) | (nearby.max(axis=1, keepdims=True) == 0)
-    return near
+    return (nearby > 0) | (nearby.max(axis=1, keepdims=True) == 0)
 
 
 def _vote(

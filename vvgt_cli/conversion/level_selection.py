@@ -44,14 +44,12 @@ class CutErrors:
     @property
     def errors(self) -> np.ndarray:
         """Return (N, CUTS) root mean square errors of a channel over the pixels that a node covers."""
-        errors: np.ndarray = np.sqrt(self.squares / np.maximum(4 * self.pixels, 1)[:, None])
-        return errors
+        return np.sqrt(self.squares / np.maximum(4 * self.pixels, 1)[:, None])
 
     def at_price(self, price: float) -> np.ndarray:
         """Return (N,) cuts with the least sum of squared error and ``price`` per Gaussian."""
         costs = (self.squares + price * self.counts)[:, ::-1]
-        cuts: np.ndarray = costs.shape[1] - 1 - costs.argmin(axis=1)
-        return cuts
+        return costs.shape[1] - 1 - costs.argmin(axis=1)
 
     def for_count(self, count: float) -> np.ndarray:
         """Return (N,) cuts of least total squared error with at most ``count`` Gaussians, by one price for all.

@@ -167,8 +167,7 @@ def read_run_manifest(path: Path, what: str = "views") -> dict[str, Any]:
         known, entries = False, []
     if not known or any(name.is_absolute() or ".." in name.parts for name, _, _ in entries):
         raise DataError(f"{path}: not a manifest of '{COMMANDS[what]}' (schema {SCHEMA}); {FRESH}")
-    result: dict[str, Any] = document
-    return result
+    return document
 
 
 def difference(there: dict[str, Any], here: dict[str, Any], what: str = "views") -> str:

@@ -89,8 +89,7 @@ def placement_warnings(volume: Volume, ply: PlyOptions) -> list[str]:
 
 def upright_axes(volume: Volume, up: str) -> np.ndarray:
     """Return the (3, 3) matrix from the box frame to the frame of previews: world directions with ``up`` along +z."""
-    result: np.ndarray = upright_matrix(up) @ volume.axes
-    return result
+    return upright_matrix(up) @ volume.axes
 
 
 def headset_axes(volume: Volume, up: str) -> Axes:

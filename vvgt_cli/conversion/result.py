@@ -263,8 +263,7 @@ class Conversion(Result):
         if normals is None:
             return None
         turned = normals @ np.linalg.inv(volume.axes)
-        found: np.ndarray = turned / np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-30)
-        return found
+        return turned / np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-30)
 
     def preview(self, size: int | None = None, views: Sequence[int] = PREVIEW_VIEWS) -> np.ndarray:
         """Draw volume, splats and eight times their difference, one row per test view, upright.

@@ -86,8 +86,7 @@ def _may_absorb(ranges: np.ndarray, tables: Optics) -> np.ndarray:
     none = ranges[..., 1] < ranges[..., 0]
     u = tables.coordinate(np.where(none[..., None], tables.lo, ranges))
     first, last = np.floor(u.min(axis=-1)).astype(np.int64), np.ceil(u.max(axis=-1)).astype(np.int64)
-    absorbs: np.ndarray = (positive[last + 1] > positive[first]) & ~none
-    return absorbs
+    return (positive[last + 1] > positive[first]) & ~none
 
 
 def empty_distance(ranges: np.ndarray, tables: Optics) -> np.ndarray:

@@ -151,8 +151,7 @@ def composite(u0: float, u1: float, dt: float, optics: Optics, light: Quad, tran
 @_jit
 def is_flat(optics: Optics) -> bool:
     """Return whether no segment needs finer samples: extinction is even at all values."""
-    even: bool = optics.even[0] >= optics.even.shape[0] - 1
-    return even
+    return optics.even[0] >= optics.even.shape[0] - 1
 
 
 @_jit

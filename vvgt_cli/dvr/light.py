@@ -68,5 +68,4 @@ def sphere(count: int) -> np.ndarray:
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:
-    unit: np.ndarray = vector / np.linalg.norm(vector)
-    return unit
+    return vector / np.linalg.norm(vector)

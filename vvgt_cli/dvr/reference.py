@@ -172,5 +172,4 @@ def render_view_reference(scene: Scene, camera: Camera, step: float = 0.125, sam
     origin, directions = rays(camera, samples)
     flat = directions.reshape(-1, 3)
     parts = [march(scene, origin, flat[i : i + SAMPLES], step) for i in range(0, len(flat), SAMPLES)]
-    result: np.ndarray = np.concatenate(parts).reshape(camera.height, camera.width, samples**2, 4).mean(axis=2)
-    return result
+    return np.concatenate(parts).reshape(camera.height, camera.width, samples**2, 4).mean(axis=2)

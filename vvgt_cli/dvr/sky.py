@@ -102,8 +102,7 @@ def pictured(path: str, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarr
     top, left = np.minimum(top, height - 1), np.minimum(left, width - 1)
     bottom, right = np.maximum(bottom, top + 1), np.maximum(right, left + 1)
     total = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
-    mean: np.ndarray = np.maximum(total, 0) / ((bottom - top) * (right - left))[:, None]
-    return mean
+    return np.maximum(total, 0) / ((bottom - top) * (right - left))[:, None]
 
 
 def _box(x: np.ndarray, y: np.ndarray, z: np.ndarray, toward: Toward, angle: float) -> np.ndarray:
@@ -116,8 +115,7 @@ def _box(x: np.ndarray, y: np.ndarray, z: np.ndarray, toward: Toward, angle: flo
 
 def _colored(*parts: tuple[np.ndarray, tuple[float, float, float]]) -> np.ndarray:
     """Sum (n,) brightnesses times colours: (n, 3)."""
-    total: np.ndarray = np.sum([part[:, None] * np.array(color) for part, color in parts], axis=0)
-    return total
+    return np.sum([part[:, None] * np.array(color) for part, color in parts], axis=0)
 
 
 def _studio(x: np.ndarray, y: np.ndarray, z: np.ndarray, _: Toward) -> np.ndarray:

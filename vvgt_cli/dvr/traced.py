@@ -210,8 +210,7 @@ def _means(sums: np.ndarray) -> np.ndarray:
     mean = sums[:3] / paths
     if sums[0].size <= 8:
         whole = (sums[:3].sum(axis=(1, 2, 3)) / sums[4].sum())[:, None, None, None]
-        alone: np.ndarray = np.where(sums[4] > 0, mean, whole)
-        return alone
+        return np.where(sums[4] > 0, mean, whole)
     half = sums
     for axis in (1, 2, 3):
         half = np.concatenate([_halved(half[:5], axis, 0.75, 0.25), _halved(half[5:], axis, 0.5625, 0.0625)])

@@ -151,5 +151,4 @@ def mix(a: Quad, b: Quad, share: float) -> Quad:
 @inlined(error_model="numpy", _nrt=False)
 def dot(a: Quad, b: Quad) -> float:
     """Return the scalar product of the first three lanes."""
-    total: float = lane(a, 0) * lane(b, 0) + lane(a, 1) * lane(b, 1) + lane(a, 2) * lane(b, 2)
-    return total
+    return lane(a, 0) * lane(b, 0) + lane(a, 1) * lane(b, 1) + lane(a, 2) * lane(b, 2)

@@ -220,5 +220,4 @@ def read_pixels(window: Any, width: int, height: int) -> np.ndarray:
 
     pixels = vtkUnsignedCharArray()
     window.GetRGBACharPixelData(0, 0, width - 1, height - 1, 0, pixels)
-    result: np.ndarray = vtk_to_numpy(pixels).reshape(height, width, 4)[::-1].astype(np.float32) / 255
-    return result
+    return vtk_to_numpy(pixels).reshape(height, width, 4)[::-1].astype(np.float32) / 255

@@ -78,8 +78,7 @@ class CellGrid:
     @property
     def cell_edge(self) -> np.ndarray:
         """Edges of a base cell in unit-frame lengths, (3,)."""
-        result: np.ndarray = self.cell * np.array(self.step)
-        return result
+        return self.cell * np.array(self.step)
 
     @property
     def tile_cells(self) -> int:
@@ -96,8 +95,7 @@ class CellGrid:
         lo, hi = self.blocks.at(number)
         first, last = lo // self.tile, -(-hi // self.tile)
         local = np.argwhere(np.ones((last - first)[::-1]))[:, ::-1]
-        result: np.ndarray = local + first
-        return result
+        return local + first
 
     def coarse_shape(self, wider: int) -> np.ndarray:
         """Return the size (3,), x first, of the grid of cells 2^``wider`` times as wide."""

@@ -57,8 +57,7 @@ def _quaternion_product(left: tuple[float, ...], right: np.ndarray) -> np.ndarra
     """Return the Hamilton product of one quaternion (w, x, y, z) with (K, 4), float64."""
     w, x, y, z = left
     table = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-    result: np.ndarray = right @ table.T
-    return result
+    return right @ table.T
 
 
 def turn(gaussians: Gaussians, up: str, *, inverse: bool = False) -> Gaussians:
@@ -242,8 +241,7 @@ def turned(gaussians: Gaussians, matrix: np.ndarray) -> np.ndarray | None:
         return None
     left, _, right = np.linalg.svd(np.asarray(matrix, np.float64))
     mixed = np.einsum("nm,kmc->knc", mixing(left @ right, gaussians.degree), gaussians.harmonics.astype(np.float64))
-    limited: np.ndarray = np.clip(mixed, -_LARGEST, _LARGEST).astype(np.float32)
-    return limited
+    return np.clip(mixed, -_LARGEST, _LARGEST).astype(np.float32)
 
 
 def mixing(matrix: np.ndarray, degree: int) -> np.ndarray:

@@ -95,8 +95,7 @@ class Table:
         f, g = (row - i)[:, None], (column - j)[:, None]
         s = self.sums
         near, far = s[i, j] * (1 - g) + s[i, j + 1] * g, s[i + 1, j] * (1 - g) + s[i + 1, j + 1] * g
-        found: np.ndarray = near * (1 - f) + far * f
-        return found
+        return near * (1 - f) + far * f
 
     def of(self, live: np.ndarray) -> np.ndarray:
         """Return the `sums` (K, 6) for rows of `Gaussians.live`."""
@@ -147,8 +146,7 @@ def law_nodes() -> np.ndarray:
     """Return quantiles (NODES,) of the normal distribution, scaled to variance 1."""
     law = NormalDist()
     found = np.array([law.inv_cdf((k + 0.5) / NODES) for k in range(NODES)])
-    stretched: np.ndarray = found / found.std()
-    return stretched
+    return found / found.std()
 
 
 def spreads() -> np.ndarray:
@@ -159,14 +157,12 @@ def spreads() -> np.ndarray:
 def _samples_of(fine: np.ndarray, nodes: np.ndarray) -> np.ndarray:
     """Return rows of ``fine`` (FINE, 4) at the samples of each distribution, (MEANS, SPREADS, NODES, 4)."""
     at = np.linspace(0, 1, MEANS)[:, None, None] + spreads()[:, None] * nodes
-    found: np.ndarray = fine[np.rint(at.clip(0, 1) * (FINE - 1)).astype(np.int64)]
-    return found
+    return fine[np.rint(at.clip(0, 1) * (FINE - 1)).astype(np.int64)]
 
 
 def lengths(mass: np.ndarray, tau: np.ndarray, most: np.ndarray) -> np.ndarray:
     """Return L (K,), unit-frame lengths, from optical masses, mean extinctions and largest volumes, each (K,)."""
-    found: np.ndarray = np.cbrt(np.minimum(mass / np.maximum(tau, 1e-30), most)).clip(SHORTEST, LONGEST)
-    return found
+    return np.cbrt(np.minimum(mass / np.maximum(tau, 1e-30), most)).clip(SHORTEST, LONGEST)
 
 
 def baked(gaussians: Gaussians, table: Looks, pixel: float = 0.0) -> Gaussians:
@@ -222,8 +218,7 @@ def without_tails(sums: np.ndarray) -> np.ndarray:
     """
     tau = sums[:, TAU]
     first, last = TAIL
-    found: np.ndarray = tau * ((last - np.abs(sums[:, FIRST]) / np.maximum(tau, 1e-30)) / (last - first)).clip(0, 1)
-    return found
+    return tau * ((last - np.abs(sums[:, FIRST]) / np.maximum(tau, 1e-30)) / (last - first)).clip(0, 1)
 
 
 def opacities(mass: np.ndarray, variances: np.ndarray, pixel: float) -> np.ndarray:
@@ -249,12 +244,10 @@ def directions(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
 def _within(axes: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Return directions (K, 3) in units of the axes (K, 3, 3), unit vectors; zeros for zeros."""
     own = np.einsum("kij,ki->kj", axes, directions)
-    found: np.ndarray = own / np.maximum(np.linalg.norm(own, axis=1, keepdims=True), 1e-30)
-    return found
+    return own / np.maximum(np.linalg.norm(own, axis=1, keepdims=True), 1e-30)
 
 
 def _narrowed(axes: np.ndarray, own: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Return axes (K, 3, 3) that are ``times`` (K,) as long along the directions ``own`` (K, 3), see `_within`."""
     arm = np.einsum("kij,kj->ki", axes, own)
-    found: np.ndarray = axes + (arm * (times - 1)[:, None])[:, :, None] * own[:, None, :]
-    return found
+    return axes + (arm * (times - 1)[:, None])[:, :, None] * own[:, None, :]

@@ -25,15 +25,13 @@ def _table() -> tuple[np.ndarray, np.ndarray]:
 
 def dilogarithm(o: np.ndarray) -> np.ndarray:
     """Return Li2(o) for o in [0, 0.99], any shape."""
-    result: np.ndarray = np.interp(o, *_table())
-    return result
+    return np.interp(o, *_table())
 
 
 def inverse_dilogarithm(y: np.ndarray) -> np.ndarray:
     """Return o in [0, 0.99] with Li2(o) = y; 0.99 where y exceeds Li2(0.99) = 1.59."""
     o, li2 = _table()
-    result: np.ndarray = np.interp(y, li2, o)
-    return result
+    return np.interp(y, li2, o)
 
 
 def peak_opacity(mass: np.ndarray, variances: np.ndarray, pixel: float) -> np.ndarray:
@@ -59,17 +57,13 @@ def opacity_when_reshaped(opacity: np.ndarray, before: np.ndarray, after: np.nda
 def projected_areas(variances: np.ndarray, pixel: float) -> np.ndarray:
     """Return ``2 pi sqrt(det S)`` (n, 3) as seen along each principal axis."""
     wide = variances + DILATION * pixel**2  # (n, 3)
-    result: np.ndarray = (
-        2 * np.pi * np.sqrt(np.stack([wide[:, 1] * wide[:, 2], wide[:, 0] * wide[:, 2], wide[:, 0] * wide[:, 1]], 1))
-    )
-    return result
+    return 2 * np.pi * np.sqrt(np.stack([wide[:, 1] * wide[:, 2], wide[:, 0] * wide[:, 2], wide[:, 0] * wide[:, 1]], 1))
 
 
 def mean_opacity(li2: np.ndarray, areas: np.ndarray) -> np.ndarray:
     """Return the alpha (n,) with dilogarithm ``li2`` (n, 3), averaged over the axes with weights ``areas`` (n, 3)."""
     opacity = inverse_dilogarithm(li2)
-    result: np.ndarray = np.minimum((opacity * areas).sum(axis=1) / areas.sum(axis=1), MAX_ALPHA)
-    return result
+    return np.minimum((opacity * areas).sum(axis=1) / areas.sum(axis=1), MAX_ALPHA)
 
 
 def logits_of(opacities: np.ndarray, least: float = 1e-7) -> np.ndarray:

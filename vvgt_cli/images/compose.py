@@ -20,8 +20,7 @@ def over(rgba: np.ndarray, background: float | Sequence[float] | np.ndarray = BL
     rgba = np.asarray(rgba, dtype=np.float32)
     if rgba.shape[-1:] != (4,):
         raise DataError(f"image of shape {rgba.shape}; expected four channels, premultiplied RGBA")
-    result: np.ndarray = rgba[..., :3] + (1 - rgba[..., 3:]) * np.asarray(background, dtype=np.float32)
-    return result
+    return rgba[..., :3] + (1 - rgba[..., 3:]) * np.asarray(background, dtype=np.float32)
 
 
 def _rgb(image: np.ndarray, background: Sequence[float]) -> np.ndarray:
@@ -29,8 +28,7 @@ def _rgb(image: np.ndarray, background: Sequence[float]) -> np.ndarray:
     image = np.asarray(image, dtype=np.float32)
     if image.ndim != 3 or image.shape[2] not in (3, 4):
         raise DataError(f"image of shape {image.shape}; expected (height, width, 3) or (height, width, 4)")
-    result: np.ndarray = np.clip(over(image, background) if image.shape[2] == 4 else image, 0, 1)
-    return result
+    return np.clip(over(image, background) if image.shape[2] == 4 else image, 0, 1)
 
 
 def side_by_side(reference: np.ndarray, ours: np.ndarray, gain: float = 8.0) -> np.ndarray:

@@ -268,8 +268,7 @@ def _bytes(image: np.ndarray) -> np.ndarray:
     image = np.fmin(np.fmax(image, 0), 1)  # NaN becomes 0
     if image.shape[2] == 4:
         image[..., :3] /= np.where(image[..., 3:] > 0, image[..., 3:], np.inf)
-    pixels: np.ndarray = np.rint(255 * np.minimum(image, 1)).astype(np.uint8)
-    return pixels
+    return np.rint(255 * np.minimum(image, 1)).astype(np.uint8)
 
 
 def read_radiance(path: str | PathLike[str]) -> np.ndarray:

@@ -133,8 +133,7 @@ def _ssim(a: np.ndarray, b: np.ndarray) -> float:
 def _gaussian(radius: int, sigma: float) -> np.ndarray:
     """Return the kernel (2 radius + 1,) float64 of a blur, with a sum of 1."""
     kernel = np.exp(-0.5 * (np.arange(-radius, radius + 1) / sigma) ** 2)
-    result: np.ndarray = kernel / kernel.sum()
-    return result
+    return kernel / kernel.sum()
 
 
 def correlate(image: np.ndarray, kernel: np.ndarray, axis: int) -> np.ndarray:
@@ -295,8 +294,7 @@ def texture(pairs: Iterable[tuple[np.ndarray, np.ndarray]]) -> Texture:
 def band(image: np.ndarray) -> np.ndarray:
     """Return the difference of RGB (h, w, 3), in levels of 255, blurred by `FINE` and by `COARSE` pixels."""
     levels = np.clip(np.asarray(image[..., :3], np.float32), 0, 1) * 255  # as on a screen
-    result: np.ndarray = _blurred(levels, FINE) - _blurred(levels, COARSE)
-    return result
+    return _blurred(levels, FINE) - _blurred(levels, COARSE)
 
 
 def _blurred(image: np.ndarray, sigma: float) -> np.ndarray:

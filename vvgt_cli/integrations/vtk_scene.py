@@ -126,8 +126,7 @@ def _mask(mapper: Any, crops: bool, image: Any, cells: bool, matrix: np.ndarray)
     def height(affine: np.ndarray, normal: Sequence[float]) -> np.ndarray:
         x, y, z = np.asarray(normal) @ affine[:3, :3]
         start = float(np.asarray(normal) @ affine[:3, 3])
-        places: np.ndarray = z * index[2][:, None, None] + y * index[1][:, None] + x * index[0] + start
-        return places
+        return z * index[2][:, None, None] + y * index[1][:, None] + x * index[0] + start
 
     affine = _affine(image)
     keep = np.ones(dims[::-1], bool)

@@ -107,8 +107,7 @@ def options_of(function: Any) -> list[tuple[str, str]] | None:
 @cache
 def _host() -> tuple[str, str, str]:
     """Return the target, the processor and its features as numba finds them, which asks the system each time."""
-    names: tuple[str, str, str] = cpu_target.target_context.codegen().magic_tuple()
-    return names
+    return cpu_target.target_context.codegen().magic_tuple()
 
 
 def processor() -> tuple[Any, ...]:

@@ -126,8 +126,7 @@ def _quantiles(counts: np.ndarray, edges: np.ndarray, fraction: np.ndarray) -> n
         raise DataError("the data have no finite voxel; expected some to take percentiles of")
     # from the first bin that counts to the last
     first, last = np.flatnonzero(counts)[[0, -1]] + [0, 2]
-    result: np.ndarray = np.interp(fraction, cumulative[first:last] / cumulative[-1], edges[first:last])
-    return result
+    return np.interp(fraction, cumulative[first:last] / cumulative[-1], edges[first:last])
 
 
 def unit_distance(spec: str | float | None, volume: Volume, tf: TransferFunction | None = None) -> tuple[float, str]:

@@ -22,8 +22,7 @@ BINS_PER_GAP = 8  # bins inside the narrowest gap between two nodes, where MAX_B
 
 def extinction(opacity: np.ndarray, unit_distance: float) -> np.ndarray:
     """Return ``tau = -ln(1 - a) / d``, a capped at 1 - 1e-5; ``opacity`` any shape, result per unit of d."""
-    result: np.ndarray = -np.log1p(-np.clip(opacity, 0.0, MAX_OPACITY)) / unit_distance
-    return result
+    return -np.log1p(-np.clip(opacity, 0.0, MAX_OPACITY)) / unit_distance
 
 
 def exposed_distance(tf: TransferFunction, statistics: Statistics, edge: float) -> float:

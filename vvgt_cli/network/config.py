@@ -177,8 +177,7 @@ class NetworkConfig:
         sides = {"image": ImageConfig, "geometry": GeometryConfig}
         try:
             known = {name: _exactly(side, values[name]) for name, side in sides.items()}
-            result: NetworkConfig = _exactly(cls, {**values, **known})
-            return result
+            return _exactly(cls, {**values, **known})
         except (KeyError, TypeError, ValueError) as error:
             raise DataError(f"network config: {error}; expected the fields of this version") from None
 

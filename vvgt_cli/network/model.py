@@ -31,8 +31,7 @@ class ImageSide(nn.Module):
 
     def forward(self, images: Tensor, poses: Tensor) -> list[Tensor]:
         """Return the S maps."""
-        result: list[Tensor] = self.maps(self.transformer(images, poses))
-        return result
+        return self.maps(self.transformer(images, poses))
 
 
 class GeometrySide(nn.Module):

@@ -158,8 +158,7 @@ def image_arrays(
 def resize(image: np.ndarray, size: int) -> np.ndarray:
     """Resample (h, w, c) to (c, size, size) by a triangle filter as wide as the coarser of the two grids."""
     rows, columns = filter_matrix(image.shape[0], size), filter_matrix(image.shape[1], size)
-    result: np.ndarray = np.einsum("ih,hwc,jw->cij", rows, image, columns, optimize=True)
-    return result
+    return np.einsum("ih,hwc,jw->cij", rows, image, columns, optimize=True)
 
 
 def filter_matrix(old: int, new: int) -> np.ndarray:
@@ -169,8 +168,7 @@ def filter_matrix(old: int, new: int) -> np.ndarray:
     ratio = old / new
     centre = (np.arange(new) + 0.5) * ratio - 0.5  # in old pixels
     weights = np.maximum(0, 1 - np.abs(centre[:, None] - np.arange(old)) / max(ratio, 1.0))
-    result: np.ndarray = (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
-    return result
+    return (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
 
 
 VIEWS = 3  # of those that the network has read

@@ -124,10 +124,7 @@ class Model:
     def _run(self, graph: str, feed: dict[str, np.ndarray]) -> list[np.ndarray]:
         session = self.sessions[graph]
         try:
-            result: list[np.ndarray] = session.run(
-                None, {entry.name: feed[entry.name] for entry in session.get_inputs()}
-            )
-            return result
+            return session.run(None, {entry.name: feed[entry.name] for entry in session.get_inputs()})
         except Exception as error:  # onnxruntime raises classes of its own C++ module
             reason = " ".join(str(error).split())[:200]
             raise DataError(f"model {self.card.name}: the {graph} graph failed ({reason})") from None

@@ -57,8 +57,7 @@ def picture_slope(
 @inlined()
 def error_slope(r: float, l1: float, l2: float) -> float:
     """Return the derivative of ``l1 |r| + l2 r^2``."""
-    slope: float = f32(2) * l2 * r + (l1 if r > 0 else -l1 if r < 0 else f32(0))
-    return slope
+    return f32(2) * l2 * r + (l1 if r > 0 else -l1 if r < 0 else f32(0))
 
 
 @parallel_kernel("f4:3 f4:3 f4 f4 f4 f4:3 f8:1")
@@ -225,8 +224,7 @@ def part_planes(thread: ThreadSlice, image: np.ndarray, target: np.ndarray, plan
 def smooth_share(red: float, green: float, blue: float, squares: float) -> float:
     """Return C / (C + v), from the means of a view's channels under the window, and of the sum of their squares."""
     variance = max(squares - (red * red + green * green + blue * blue), f32(0)) * f32(1 / 3)  # mean of the channels
-    share: float = f32(SMOOTH) / (f32(SMOOTH) + variance)
-    return share
+    return f32(SMOOTH) / (f32(SMOOTH) + variance)
 
 
 @parallel_kernel("f4:3 f4:3 f8:1", error_model="numpy")

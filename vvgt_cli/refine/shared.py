@@ -64,8 +64,7 @@ def aligned(means: np.ndarray, factors: np.ndarray, logits: np.ndarray, colors: 
     known = np.concatenate([values[:, :7], beside[:, :7], far], axis=1)
     spread = known.std(axis=0, dtype=np.float64)
     scaled = (known - known.mean(axis=0, dtype=np.float64)) / np.where(spread > 1e-9, spread, np.inf)
-    standard: np.ndarray = np.clip(scaled, -FARTHEST, FARTHEST).astype(np.float32)
-    return standard
+    return np.clip(scaled, -FARTHEST, FARTHEST).astype(np.float32)
 
 
 def sample_of(count: int) -> tuple[int, int]:
@@ -111,8 +110,7 @@ class SharedSteps:
         def rows(part: np.ndarray) -> np.ndarray:
             bent = np.maximum(part @ mixing + offsets, 0) - middle
             features = np.concatenate([np.ones((len(part), 1), np.float32), part, bent], axis=1)
-            rounded: np.ndarray = np.clip(np.rint(features * ONE), -MAX_FEATURE, MAX_FEATURE)
-            return rounded
+            return np.clip(np.rint(features * ONE), -MAX_FEATURE, MAX_FEATURE)
 
         numbers = rows(some).astype(np.float64)
         square = numbers.T @ numbers

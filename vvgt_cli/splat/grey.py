@@ -63,8 +63,7 @@ def xray(gaussians: Gaussians, table: Table, camera: Camera) -> np.ndarray:
     oblique = np.linalg.norm(place, axis=0) / place[2]
     peak = mass * per_area * oblique / -math.expm1(-REACH)
     fields = np.stack([peak, np.zeros_like(peak), np.zeros_like(peak)], axis=1)
-    absorbed: np.ndarray = -np.expm1(-_accumulated(projection, fields, camera, False))
-    return absorbed
+    return -np.expm1(-_accumulated(projection, fields, camera, False))
 
 
 def _projected(gaussians: Gaussians, camera: Camera) -> Projection:

@@ -57,8 +57,7 @@ def rotation_column(w: float, a: float, b: float, c: float, axis: int) -> tuple[
 @_jit
 def _opacity(logits: np.ndarray, k: int) -> float:
     """Return the sigmoid of ``logits`` (K,) of Gaussian k, float64."""
-    opacity: float = 1.0 / (1.0 + math.exp(-np.float64(logits[k])))
-    return opacity
+    return 1.0 / (1.0 + math.exp(-np.float64(logits[k])))
 
 
 def _project(

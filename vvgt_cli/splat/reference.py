@@ -15,8 +15,7 @@ from vvgt_cli.gaussians.frames import rotations as rotations
 def covariances(gaussians: Gaussians) -> np.ndarray:
     """Return ``R diag(s^2) R^T``, (K, 3, 3) float64, unit-frame lengths squared."""
     factors = axes_of(gaussians)
-    result: np.ndarray = factors @ factors.transpose(0, 2, 1)
-    return result
+    return factors @ factors.transpose(0, 2, 1)
 
 
 def project(gaussians: Gaussians, camera: Camera, rule: Rule = INRIA) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -242,8 +242,7 @@ def screen_slopes(projection: Projection, pairs: np.ndarray) -> np.ndarray:
     p, sums = projection, np.zeros((len(projection.flat), 5))
     tiles.reduce_pairs(p.first, np.ascontiguousarray(pairs[:, :5]), sums)
     a, b, c = p.flat[:, 2:5].T.astype(np.float64)
-    lengths: np.ndarray = np.hypot(a * sums[:, 1] + b * sums[:, 2], b * sums[:, 1] + c * sums[:, 2])
-    return lengths
+    return np.hypot(a * sums[:, 1] + b * sums[:, 2], b * sums[:, 1] + c * sums[:, 2])
 
 
 def pair_sums(projection: Projection, colors: np.ndarray, image: np.ndarray, grad: np.ndarray) -> np.ndarray:

@@ -13,8 +13,7 @@ from vvgt_cli.jit.decorators import inlined, kernel
 def _error(sums: np.ndarray, start: int, end: int) -> float:
     """Return the squared error of the interval from ``start`` to before ``end`` around its mean."""
     weight, first = sums[0, end] - sums[0, start], sums[1, end] - sums[1, start]
-    error: float = sums[2, end] - sums[2, start] - first * first / weight
-    return error
+    return sums[2, end] - sums[2, start] - first * first / weight
 
 
 @kernel("f8:2 i4:2")

@@ -97,8 +97,7 @@ def _fallback(splats: Splats) -> np.ndarray:
     """Return (K, 4) uint16: colours without harmonics, in linear light as glTF has it, and opacities, of 65,535."""
     shown = np.clip(f_dc_to_colors(splats.f_dc), 0, 1)
     light = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
-    levels: np.ndarray = np.rint(65535 * np.column_stack([light, opacities_of(splats.logits)])).astype("<u2")
-    return levels
+    return np.rint(65535 * np.column_stack([light, opacities_of(splats.logits)])).astype("<u2")
 
 
 def _child(document: dict[str, Any], parent: int, node: dict[str, Any]) -> int:

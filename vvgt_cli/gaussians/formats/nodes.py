@@ -128,8 +128,7 @@ def offset_in(root: np.ndarray, place: np.ndarray, comments: tuple[str, ...], na
         same_place(one, comments, name)
     if np.array_equal(root, place):
         return np.zeros(3)
-    offset: np.ndarray = (np.linalg.inv(root) @ place)[:3, 3]
-    return offset
+    return (np.linalg.inv(root) @ place)[:3, 3]
 
 
 def same_place(matrix: np.ndarray, comments: tuple[str, ...], name: str) -> None:

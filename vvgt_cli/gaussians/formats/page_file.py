@@ -146,8 +146,7 @@ def farthest(places: np.ndarray) -> list[list[float]]:
     towards = np.array([d for d in product(range(-2, 3), repeat=3) if any(d)]).T
     if not len(places):
         return []
-    chosen: list[list[float]] = places[np.unique((places @ towards).argmax(axis=0))].round(3).tolist()
-    return chosen
+    return places[np.unique((places @ towards).argmax(axis=0))].round(3).tolist()
 
 
 def _visible(clouds: Sequence[Splats]) -> np.ndarray:

@@ -156,8 +156,7 @@ def parse_light(sent: Any, options: PlyOptions) -> Lighting | None:
 
 def _axes(up: str) -> np.ndarray:
     """Return the axes of the unit frame in the viewer's frame, as rows."""
-    axes: np.ndarray = (np.diag(VIEWER) @ up_matrix(up)).T
-    return axes
+    return (np.diag(VIEWER) @ up_matrix(up)).T
 
 
 def nodes_of(facts: LiveFacts) -> list[dict[str, Any]]:

@@ -172,8 +172,7 @@ def _harmonics(meta: dict[str, Any], pixels: Callable[..., np.ndarray], name: st
     needed = math.ceil((int(labels.max()) + 1) / _ROW) * _ROW * each
     centroids = pixels("shN", 0, _ROW * each, needed)[:, :3].reshape(-1, each, 3)
     book: np.ndarray = _numbers(meta, "shN", "codebook", SIZE, name).astype(np.float32)
-    harmonics: np.ndarray = book[centroids][labels]
-    return harmonics
+    return book[centroids][labels]
 
 
 def _part(meta: dict[str, Any], part: str, key: str) -> Any:

@@ -140,5 +140,4 @@ def interleave(cells: np.ndarray) -> np.ndarray:
     for shift, mask in _SPREAD:  # bit i moves to bit 3 i
         bits = (bits | bits << np.uint64(shift)) & np.uint64(mask)
     first, second, third = bits.T.astype(np.int64)
-    code: np.ndarray = first << 2 | second << 1 | third
-    return code
+    return first << 2 | second << 1 | third

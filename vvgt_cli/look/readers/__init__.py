@@ -69,8 +69,7 @@ def _read(parsed: Any, what: str, pick: str) -> TransferFunction:
     """Return the function of a parsed file, by the first format that matches."""
     for reader in FORMATS:
         if reader.matches(parsed):
-            result: TransferFunction = reader.read(parsed, what, pick)
-            return result
+            return reader.read(parsed, what, pick)
     raise DataError(
         f"{what}: not a transfer function; expected a preset of ParaView or vtk.js (RGBPoints), an object with points, "
         "a volume property of 3D Slicer, a colour map of niivue (R, G, B), XML of ParaView or Inviwo"

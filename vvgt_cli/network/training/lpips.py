@@ -69,8 +69,7 @@ def load_lpips(config: LossConfig) -> Lpips | None:
     network = Lpips()
     state = _backbone(config.lpips_backbone) | _linear(config.lpips_linear)
     load_weights(network, state, f"{config.lpips_backbone}, {config.lpips_linear}")
-    result: Lpips = network.eval()
-    return result
+    return network.eval()
 
 
 def _backbone(path: str | Path) -> dict[str, Tensor]:

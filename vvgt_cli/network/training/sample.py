@@ -193,8 +193,7 @@ def splat(rows: Tensor, camera: Camera) -> Tensor:
     """
     if rows.is_cuda and importlib.util.find_spec("gsplat"):
         return gsplat_picture(rows, camera)
-    picture: Tensor = Splat.apply(rows, camera)
-    return picture
+    return Splat.apply(rows, camera)
 
 
 def gsplat_picture(rows: Tensor, camera: Camera) -> Tensor:

@@ -160,8 +160,7 @@ def _key(recipe: Recipe, config: SceneConfig) -> str:
 
 
 def _about(place: Path) -> dict[str, Any]:
-    about: dict[str, Any] = json.loads((place / "about.json").read_text("utf-8"))
-    return about
+    return json.loads((place / "about.json").read_text("utf-8"))
 
 
 def view_sets(config: SceneConfig, size: int) -> tuple[list[Camera], list[Camera]]:

@@ -73,8 +73,7 @@ def _picture(image: Any, path: Path) -> Micrograph:
     times, channels, samples, nz, ny, nx = values.shape
 
     def read(time: int, channel: int, box: Slices) -> np.ndarray:
-        part: np.ndarray = values[time, channel // samples, channel % samples][box]
-        return part
+        return values[time, channel // samples, channel % samples][box]
 
     spacing, origin = _placed(image)
     names, colors = _channels(image) if samples == 1 else ([], [])
