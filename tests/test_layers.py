@@ -392,6 +392,19 @@ def test_rays_classify_scalars_between_voxels(other: str, light: str) -> None:
     assert psnr(shown, twin) > 50  # 32 to 34 of a grid of classified voxels
 
 
+def test_opaque_steps_of_layers_are_where_the_function_has_them() -> None:
+    """Bins of tables are narrow beside a function's nodes, and surfaces that rays graze between samples are found."""
+    z, y, x = np.mgrid[:16, :16, :16]
+    hills = Volume((1000 + 40 * np.sin(0.9 * x) * np.cos(0.8 * y) * np.sin(0.7 * z + 1)).astype(np.float32))
+    x = np.array([0.0, 1004.0, 1004.1, 4000.0])
+    colors = np.array([(1.0, 0.2, 0.2), (1.0, 0.2, 0.2), (0.2, 1.0, 0.2), (0.2, 1.0, 0.2)])
+    step = TransferFunction("step", PiecewiseOpacity(x, np.array([0.0, 0.0, 1.0, 1.0])), ColorMap(x, colors))
+    scene = load(SourceRequest(hills, band(970, 5, (0.2, 0.2, 1.0)), layers=(SourceRequest(hills, step),))).scene()
+    camera = default_views("train", size=64)[3]
+    shown, twin = render_view(scene, camera, RenderSettings(samples=1)), render_view_reference(scene, camera, 0.03)
+    assert psnr(shown, twin) > 52  # 50 with bins nine times as wide and steps that are looked for between ends alone
+
+
 @pytest.mark.parametrize("slices", [1, 2, 4])
 def test_thin_layers_on_another_grid_are_as_thick_as_their_boxes(slices: int) -> None:
     first = cloud((16, 16, 16))

@@ -182,18 +182,19 @@ def _layer_mean(mixture: Mixture, k: int, u0: float, u1: float) -> Quad:
 
 @_jit
 def _pass_layers(
-    mixture: Mixture, p: Vector, d: Vector, t: float, dt: float, a: Quad, b: Quad, then: Run, now: Run, within: Run,
-    own: Any, seen: Quad, trans: float,
+    mixture: Mixture, p: Vector, d: Vector, t: float, dt: float, a: Quad, b: Quad, before: Run, then: Run, now: Run,
+    inner: Run, own: Any, seen: Quad, trans: float,
 ) -> tuple[Quad, float, float, float]:  # fmt: skip
     """Return `pass_segment` of a mixture with scalars, from texel ``a`` and coordinates ``then`` to ``b`` and ``now``.
 
-    ``then`` becomes ``now``, ``within`` is overwritten. ``own`` is None, or is filled with (r, g, b, alpha) of each
-    layer of scalars and, behind them, of the texels.
+    ``before`` (coordinates a segment earlier) becomes ``then``, that ``now``; ``inner`` is overwritten. ``own`` is None
+    or is filled with (r, g, b, alpha) of each layer of scalars and, behind them, of the texels.
     """
     count, whole, place, squared = mixture.scalars.shape[0], trans, 0.0, 0.0
     total, shown, steep = scale(0.5, add(a, b)), lane(a, 3) + lane(b, 3) > 0.0, False
     for k in range(count):
-        low, high = min(then[k], now[k]), max(then[k], now[k])
+        low, high = values_met(before[k], then[k], now[k], False)
+        before[k] = then[k]
         if low < 0.0:  # the face of a layer, or a voxel that is none, lies between
             if high > mixture.dark[k, U(int(max(high, 0.0)))]:
                 shown = steep = True
@@ -214,24 +215,24 @@ def _pass_layers(
     for n in range(1, parts + 1):
         s, c = t + n * part, b
         if n < parts:
-            c = _sample_layers(mixture, mixture.scalars, px + s * dx, py + s * dy, pz + s * dz, within)
+            c = _sample_layers(mixture, mixture.scalars, px + s * dx, py + s * dy, pz + s * dz, inner)
         else:
             for k in range(count):
-                within[k] = now[k]
+                inner[k] = now[k]
         total = scale(0.5 * part, add(a, c))
         for k in range(count):
-            total = add(total, scale(part, _layer_mean(mixture, k, then[k], within[k])))
+            total = add(total, scale(part, _layer_mean(mixture, k, then[k], inner[k])))
         depth = max(lane(total, 3), 0.0)
         f = absorbed(depth) * trans
         if own is None:
             seen = add(seen, scale(f, total))
         else:
             for k in range(count + 1):
-                one = scale(0.5, add(a, c)) if k == count else _layer_mean(mixture, k, then[k], within[k])
+                one = scale(0.5, add(a, c)) if k == count else _layer_mean(mixture, k, then[k], inner[k])
                 for n4 in range(4):
                     own[4 * k + n4] += f * part * lane(one, n4)
         for k in range(count):
-            then[k] = within[k]
+            then[k] = inner[k]
         a, trans, place = c, trans - f * depth, place + f * depth * (n - 0.5)
         squared += f * depth * (n - 0.5) * (n - 0.5)
     start, end = spread(whole - trans, place, squared, parts)
@@ -243,12 +244,9 @@ def _through_mixture(
     mixture: Mixture, scalars: Any, voxels: Voxels, empty: np.ndarray, light: Any, p: Vector, d: Vector,
     t0: float, dt: float, first: int, last: int, step: float,
 ) -> tuple[float, float, float, float]:  # fmt: skip
-    """Return `_through_values` of an optics grid: along a segment the texels are linear.
-
-    ``scalars``: those of the mixture.
-    """
+    """Return `_through_values` of an optics grid of ``scalars`` and texels; along a segment the latter are linear."""
     (px, py, pz), (dx, dy, dz), shape = p, d, voxels.values.shape
-    then, now, within, parts = stack_run(), stack_run(), stack_run(), stack_run()
+    before, then, now, inner, parts = stack_run(), stack_run(), stack_run(), stack_run(), stack_run()
     seen: Quad = zeros4()
     trans, red, green, blue = 1.0, 0.0, 0.0, 0.0
     opaque = OPAQUE * min(step * step, 1.0)
@@ -271,16 +269,20 @@ def _through_mixture(
         if not known:
             if scalars is not None:
                 for k in range(scalars.shape[0]):
-                    then[k] = now[k]
+                    before[k], then[k] = -1.0, now[k]
         elif light is None:
             if scalars is not None:
-                seen, trans, _, _ = _pass_layers(mixture, p, d, here, dt, a, b, then, now, within, None, seen, trans)
+                seen, trans, _, _ = _pass_layers(
+                    mixture, p, d, here, dt, a, b, before, then, now, inner, None, seen, trans
+                )
             elif lane(a, 3) + lane(b, 3) > 0.0:
                 seen, trans = blend_texels(a, b, dt, seen, trans)
         else:
             own, begin, end = zeros4(), here, t
             if scalars is not None:
-                _, trans, begin, end = _pass_layers(mixture, p, d, here, dt, a, b, then, now, within, parts, own, trans)
+                _, trans, begin, end = _pass_layers(
+                    mixture, p, d, here, dt, a, b, before, then, now, inner, parts, own, trans
+                )  # fmt: skip
                 for k in range(scalars.shape[0]):
                     own = vector(parts[4 * k], parts[4 * k + 1], parts[4 * k + 2], parts[4 * k + 3])
                     if lane(own, 3) > 0.0:

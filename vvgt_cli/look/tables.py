@@ -117,12 +117,12 @@ def _flat_until(nodes: np.ndarray, most: float) -> np.ndarray:
     return at.astype(np.float64)
 
 
-def _bin_count(tf: TransferFunction, lo: float, hi: float) -> int:
+def _bin_count(tf: TransferFunction, lo: float, hi: float, beside: float) -> int:
     nodes = np.asarray(getattr(tf, "breakpoints", tf.node_range)(), np.float64)
     gaps = np.diff(np.unique(np.clip(nodes, lo, hi)))
     gaps = gaps[gaps > (hi - lo) / MAX_BINS]
     wanted = BINS_PER_GAP * (hi - lo) / gaps.min() if len(gaps) else MAX_BINS
-    return int(2 ** math.ceil(math.log2(min(max(wanted, MIN_BINS), MAX_BINS))))
+    return int(2 ** math.ceil(math.log2(min(max(wanted, MIN_BINS * beside), MAX_BINS))))
 
 
 def build_tables(
@@ -142,14 +142,16 @@ def build_tables(
     voxel's mean edge in the latter.
     """
     first, last = tf.node_range()
-    lo, hi = max(value_range[0], first), min(value_range[1], last)
+    lo, hi, beside = max(value_range[0], first), min(value_range[1], last), 1.0
     if not hi > lo:  # data wholly beyond one end node, or a constant: one value of the function is used
         lo = hi = min(max(value_range[0], first), last)
         hi = math.nextafter(lo + max(abs(lo), 1e-30) * 1e-6, math.inf)
     else:
         margin = BESIDE * (hi - lo)
-        lo, hi = max(value_range[0], lo - margin), min(value_range[1], hi + margin)
-    count = bins or _bin_count(tf, lo, hi)
+        wide = max(value_range[0], lo - margin), min(value_range[1], hi + margin)
+        beside = (wide[1] - wide[0]) / (hi - lo)
+        lo, hi = wide
+    count = bins or _bin_count(tf, lo, hi, beside)
     x = lo + (hi - lo) * (np.arange(count + 1) / count)
     x[-1] = hi
     tau = extinction(tf.opacity(x), unit_distance) * world_per_unit
