@@ -253,7 +253,7 @@ def _through_mixture(
     ix, iy, iz, per_step = inverse(dx), inverse(dy), inverse(dz), 1.0 / dt
     look = d if light is None else (dx * light.edge[0], dy * light.edge[1], dz * light.edge[2])
     a, known = zeros4(), False
-    i, stop = first, first
+    i = stop = max(first - 1, 0)  # one earlier, for what bends the next
     while i <= last and trans >= opaque:
         if i >= stop:
             at = i - 1 if known else i
@@ -261,15 +261,15 @@ def _through_mixture(
             if start >= last:
                 break
             if start > at:
-                known, i = False, start
+                known, i = False, max(start - 1, i)
             stop = i + LEAP
         t = t0 + i * dt
         b = _sample_layers(mixture, scalars, px + t * dx, py + t * dy, pz + t * dz, now)
         here, ahead = t - dt, trans
-        if not known:
+        if not known or i <= first:
             if scalars is not None:
                 for k in range(scalars.shape[0]):
-                    before[k], then[k] = -1.0, now[k]
+                    before[k], then[k] = then[k] if known else -1.0, now[k]
         elif light is None:
             if scalars is not None:
                 seen, trans, _, _ = _pass_layers(

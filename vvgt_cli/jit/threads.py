@@ -55,4 +55,4 @@ def on_all_threads(body: Any, name: str) -> Callable[..., None]:
     exec(f"def {name}({names}):\n    run(body, ({names},))", scope)
     made: Any = scope[name]
     made.__module__, made.__qualname__, made.__doc__ = function.__module__, name, function.__doc__
-    return made  # type: ignore[no-any-return]
+    return made
