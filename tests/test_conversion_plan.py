@@ -201,7 +201,7 @@ def darkened(g):
 @pytest.mark.parametrize(
     ("page", "text"),
     [
-        ("docs/python.md", "1080 px and {} steps"),
+        ("README.md", "({} steps)"), ("docs/python.md", "1080 px and {} steps"),
         ("docs/optimize.md", "Then follow {} steps"), ("docs/blocks.md", "`--steps` ({})"),
         ("docs/commands/convert.md", "takes [{} steps]"),
     ],

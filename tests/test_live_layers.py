@@ -153,7 +153,7 @@ def test_recolor_shows_one_of_several(vvgt, pair, tmp_path) -> None:
     assert "not one of" in vvgt.fails(1, "recolor", live, *every, "-o", tmp_path / "x.ply")
     for more, said in (
         (("--tf", "viridis"), "3 layers, each with its own look"),
-        (("--layer", "elsewhere,tf=viridis"), "no layers of that name; expected one of left"),
+        (("--layer", "elsewhere,tf=viridis"), "no layers of that name; expected 0 (left)"),
         (("--layer", "lefft,tf=viridis"), "no layers of that name; did you mean left?"),
         (("--layer", "t,tf=viridis"), "3 layers of that name"),
         (("--layer", "2,tf=viridis"), "carry labels, not values"),

@@ -165,7 +165,7 @@ def write_arrays(path: str | os.PathLike[str], arrays: np.ndarray | dict[str, np
 
     with atomic_write(path, overwrite=True) as temporary, open(temporary, "wb") as stream:
         if isinstance(arrays, dict):
-            np.savez(stream, allow_pickle=False, **arrays)
+            np.savez(stream, **arrays)
         else:
             np.save(stream, arrays, allow_pickle=False)
 

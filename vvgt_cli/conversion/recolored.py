@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from difflib import get_close_matches
 
 import numpy as np
 
@@ -19,7 +20,6 @@ from vvgt_cli.look import LabelTable, Lighting, LightOptions, TransferFunction, 
 from vvgt_cli.look.resolve import unit_of_values
 from vvgt_cli.look.tables import exposed_distance
 from vvgt_cli.volume import Volume
-from vvgt_cli.volume.components import expected
 
 # function or label table of each layer, with its opacity unit distance (world length)
 LayerLooks = Sequence[tuple[TransferFunction | LabelTable, float]]
@@ -173,7 +173,8 @@ def layer_number(name: str, layers: Sequence[LiveFacts], asked: str) -> int:
     exact = [k for k, layer in enumerate(layers) if layer.name == asked]
     numbers = exact or [k for k, layer in enumerate(layers) if asked.lower() in layer.name.lower()]
     if len(numbers) != 1:
-        hint = _listed(layers) if numbers else expected(asked, [layer.name for layer in layers])
+        near = get_close_matches(asked, [layer.name for layer in layers]) if not numbers else []
+        hint = f"did you mean {' or '.join(near)}?" if near else _listed(layers)
         raise UsageError(f"{name}: --layer {asked}: {len(numbers) or 'no'} layers of that name; {hint}")
     return numbers[0]
 

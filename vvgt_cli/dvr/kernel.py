@@ -175,7 +175,8 @@ def spread(total: float, first: float, second: float, parts: int) -> tuple[float
         return 0.0, 0.0
     middle = first / total
     half = math.sqrt(3.0 * max(second / total - middle * middle, 0.0) + 0.25)
-    return max(middle - half, 0.0), min(middle + half, float(parts))
+    half = min(half, middle, parts - middle)
+    return middle - half, middle + half
 
 
 @_jit

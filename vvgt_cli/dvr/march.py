@@ -96,10 +96,15 @@ def shade_segment(
     b, bend, times = a, zeros4(), 1
     if not thin:
         b = slope_on_ray(values, light, p, d, end)
+        if not dot(a, a) < np.inf:
+            a = b
+        elif not dot(b, b) < np.inf:
+            b = a
         along = dot(a, b)
         times = 2 if along > 0.0 and along * along > ALIKE * dot(a, a) * dot(b, b) else TURNS
-        if times == TURNS:
-            bend = sub(scale(4.0, slope_on_ray(values, light, p, d, middle)), scale(2.0, add(a, b)))
+        halfway = slope_on_ray(values, light, p, d, middle) if times == TURNS else a
+        if times == TURNS and dot(halfway, halfway) < np.inf:
+            bend = sub(scale(4.0, halfway), scale(2.0, add(a, b)))
     for n in range(times):
         f = (n + 0.5) / times
         factor, white = shading(light, unit(add(mix(a, b, f), scale(f * (1.0 - f), bend))), look)

@@ -43,7 +43,7 @@ from vvgt_cli.volume.stored import Stored, is_file_backed, planes
 if TYPE_CHECKING:
     from vvgt_cli.field.cells import Reader
 
-LAYOUT = 9  # version of the stored blocks: increase it whenever their content changes
+LAYOUT = 10  # version of the stored blocks: increase it whenever their content changes
 MIN_BLOCKED = 1 << 30  # bytes of values: more are processed in blocks, with a tenth of the memory (docs/log/blocks.md)
 LARGE = 0.25  # share of the free memory: smaller files are always read whole
 CELL_BYTES = 300  # of a base cell in memory

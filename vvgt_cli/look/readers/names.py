@@ -86,7 +86,7 @@ def _colors(name: str) -> np.ndarray:
     if name not in colormaps:
         raise UsageError(
             f"transfer function {name!r}: neither a file, a name of 'vvgt tf list' nor a matplotlib colour map; "
-            + expected(name, [*names(), *colormaps])
+            + expected(name, [*colormaps, *names()])
         )
     chosen = colormaps[name]
     return np.asarray(chosen(np.linspace(0, 1, min(max(chosen.N, 2), MAX_NODES))), dtype=np.float64)[:, :3]

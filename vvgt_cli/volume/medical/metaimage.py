@@ -75,6 +75,8 @@ def _place(fields: HeaderFields, n: int, options: ReadOptions) -> dict[str, Any]
     factor = 1.0
     if space is not None:
         factor, unit = (metres(unit) or MILLIMETRE) / MILLIMETRE, ""
+    if options.spacing is not None:
+        spacing = np.where(spacing == 0, 1.0, spacing)  # an axis has a direction, whatever its length
     return {"steps": factor * spacing[:, None] * rows, "origin": factor * origin, "space": space, "unit": unit}
 
 
