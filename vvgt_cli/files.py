@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from typing import IO, TYPE_CHECKING, Any
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.resources import free_memory
@@ -159,7 +159,7 @@ def atomic_write(path: str | os.PathLike[str], overwrite: bool = False) -> Itera
         _leftovers.discard(temporary)
 
 
-def write_arrays(path: str | os.PathLike[str], arrays: np.ndarray | dict[str, np.ndarray]) -> None:
+def write_arrays(path: str | os.PathLike[str], arrays: np.ndarray | dict[str, Any]) -> None:
     """Write an array as .npy, or several by name as .npz, in place of a file at ``path``; errors: `atomic_write`."""
     import numpy as np
 
