@@ -20,7 +20,7 @@ def test_too_many_labels_are_converted_first(monkeypatch: pytest.MonkeyPatch) ->
     request = SourceRequest(labels, labels="auto")
     asked = []
 
-    def conversion(request: ConvertRequest, console: Console, start: Any, unscored: Any) -> Any:
+    def conversion(request: ConvertRequest, console: Console, warm: Any, unscored: Any) -> Any:
         asked.append(request.live)
         unscored("conversion")
         return SimpleNamespace(scores={"psnr": 40.0})
