@@ -52,7 +52,7 @@ from vvgt_cli.jit.decorators import inlined, parallel_kernel
 from vvgt_cli.jit.threads import ThreadSlice, iterations, next_iteration
 
 P = ParamSpec("P")
-SHADED_TWICE = 0.03  # of the light: what a segment absorbs from which on the normal may turn within it
+TURNING = 0.03  # of the light: what a segment absorbs from which on the normal may turn within it
 TURNS, ALIKE = 12, 0.9  # normals that are shaded where it does; squared cosine from which on it does not
 LEAP = 8  # samples of a grid between two looks at the empty-space map
 
@@ -81,7 +81,7 @@ def shade_segment(
     """Shade a segment's ``own`` (r, g, b, alpha), seen along ``look``; no colour exceeds its alpha.
 
     ``trans`` of the light passes what is before it. It absorbs from ``start`` to ``end`` of the ray p + t d; in the
-    middle light is taken that is traced to a grid, and the normal of a segment that absorbs at most `SHADED_TWICE`. Of
+    middle light is taken that is traced to a grid, and the normal of a segment that absorbs at most `TURNING`. Of
     others two normals are shaded, or `TURNS` where the gradient, quadratic along the ray, turns: where its sign changes
     a surface is dark on so short a way that single samples of it would draw lines.
     """
@@ -91,7 +91,7 @@ def shade_segment(
         red, green = shade_at(light, 0, x, y, z) * lane(own, 0), shade_at(light, 1, x, y, z) * lane(own, 1)
         return min(red, most), min(green, most), min(shade_at(light, 2, x, y, z) * lane(own, 2), most)
     red = green = blue = 0.0
-    thin = most <= SHADED_TWICE * trans
+    thin = most <= TURNING * trans
     a = slope_on_ray(values, light, p, d, middle if thin else start)
     b, bend, times = a, zeros4(), 1
     if not thin:
