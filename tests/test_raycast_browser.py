@@ -122,6 +122,20 @@ def test_labels_are_hidden_and_coloured(tmp_path: Path, light: str) -> None:
     assert psnr(one, seen) > max(57, psnr(both, seen) + 10)
 
 
+@pytest.mark.parametrize("light", ["none", "headlight"])
+def test_a_layer_that_goes_on_beyond_the_first_volume(tmp_path: Path, light: str) -> None:
+    z, y, x = np.mgrid[:24, :24, :24]
+    np.save(tmp_path / "waves.npy", (np.sin(0.7 * x) * np.cos(0.6 * y) + z / 24).astype(np.float32))
+    (tmp_path / "tf.json").write_text(json.dumps(SHELL))
+    path, page = tmp_path / "waves.npy", tmp_path / "layers.html"
+    source = [str(path), "--crop", "5:19,:,3:", "--tf", "viridis", "--light", light]
+    source += ["--layer", f"{path},tf={tmp_path / 'tf.json'}"]
+    assert run(["convert", *source, *MADE, "-o", str(page)]) == 0
+    found = psnr(rendered(tmp_path, *source), pictured(page, tmp_path, ""))
+    print(f"{light}: {found:.2f} dB")
+    assert found > 40
+
+
 BALLS = ((12, 16, 16, 6), (34, 16, 16, 6))  # x, y, z of the middle and radius, voxels
 
 

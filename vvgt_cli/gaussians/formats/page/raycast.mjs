@@ -46,6 +46,11 @@ ${each((k, { labels, one }) => `uniform ${labels ? 'usampler3D' : 'sampler3D'} v
 uniform sampler3D b${k};
 uniform mat4 m${k};
 uniform vec3 n${k}, f${k};  // dims; value at 0, what it gains, first row of the table
+${k ? `uniform mat4 g${k}, h${k};  // from the first grid to this one, and back
+vec3 framed${k}(vec3 q) {  // as \`vvgt render\` lays layers on the first grid: between its faces and its outermost voxels' centres nothing changes
+  vec3 first = (h${k} * vec4(q, 1.0)).xyz, e = 0.5 / n0, c = clamp(first, e, 1.0 - e);
+  return q + mat3(g${k}) * (c - first);
+}` : 'vec3 framed0(vec3 q) { return q; }'}
 vec2 empty${k}(vec3 p, vec3 d, float best) {  // how far to the end of a block; 1: it shows something
   vec3 edge = n${k} / ${BLOCK}.0, q = (m${k} * vec4(p, 1.0)).xyz, r = mat3(m${k}) * d * edge;
   if (!within(q)) return vec2(ds, 0.0);
@@ -55,7 +60,7 @@ vec2 empty${k}(vec3 p, vec3 d, float best) {  // how far to the end of a block; 
 }
 ${labels ? `vec4 look${k}(ivec3 i) { return entry(float(texelFetch(v${k}, i, 0).r), int(f${k}.z)); }
 vec4 at${k}(vec3 p) {
-  vec3 q = (m${k} * vec4(p, 1.0)).xyz, x = clamp(q * n${k} - 0.5, vec3(0.0), n${k} - 1.0), f = fract(x);
+  vec3 q = (m${k} * vec4(p, 1.0)).xyz, x = clamp(framed${k}(q) * n${k} - 0.5, vec3(0.0), n${k} - 1.0), f = fract(x);
 ${k ? '  if (!within(q)) return vec4(0.0);' : ''}
   ivec3 i = ivec3(x), j = min(i + 1, ivec3(n${k}) - 1);
   return mix(mix(mix(look${k}(i), look${k}(ivec3(j.x, i.yz)), f.x), mix(look${k}(ivec3(i.x, j.y, i.z)), look${k}(ivec3(j.xy, i.z)), f.x), f.y),
@@ -63,7 +68,7 @@ ${k ? '  if (!within(q)) return vec4(0.0);' : ''}
 }
 // the gradient of extinction, smoothed as vvgt_cli/dvr/relief.py does: of a sum over 3 x 3 x 3 voxels, by central differences that are interpolated
 vec3 smooth${k}(vec3 p) {
-  vec3 q = clamp((m${k} * vec4(p, 1.0)).xyz * n${k} - 0.5, vec3(0.0), n${k} - 1.0), f = fract(q), g = vec3(0.0);
+  vec3 q = clamp(framed${k}((m${k} * vec4(p, 1.0)).xyz) * n${k} - 0.5, vec3(0.0), n${k} - 1.0), f = fract(q), g = vec3(0.0);
   ivec3 first = ivec3(q), last = ivec3(n${k}) - 1;
   float own = look${k}(first).a;
   bool inside = true;  // as most of a body is
@@ -77,11 +82,11 @@ vec3 smooth${k}(vec3 p) {
   return (g * n${k}) * mat3(m${k});
 }` : `float value${k}(vec3 p) {
   vec3 q = (m${k} * vec4(p, 1.0)).xyz;
-  return ${k ? '!within(q) ? -1e4 : ' : ''}f${k}.x + f${k}.y * texture(v${k}, q).r;
+  return ${k ? '!within(q) ? -1e4 : ' : ''}f${k}.x + f${k}.y * texture(v${k}, framed${k}(q)).r;
 }
 vec3 gradient${k}(vec3 p) {
-  vec3 e = 1.0 / n${k}, q = clamp((m${k} * vec4(p, 1.0)).xyz, 0.5 * e, 1.0 - 0.5 * e);
-  float a[6] = float[6](texture(v${k}, q + vec3(e.x, 0, 0)).r, texture(v${k}, q + vec3(0, e.y, 0)).r, texture(v${k}, q + vec3(0, 0, e.z)).r, texture(v${k}, q - vec3(e.x, 0, 0)).r, texture(v${k}, q - vec3(0, e.y, 0)).r, texture(v${k}, q - vec3(0, 0, e.z)).r);
+  vec3 e = 1.0 / n${k}, q = clamp(framed${k}((m${k} * vec4(p, 1.0)).xyz), 0.5 * e, 1.0 - 0.5 * e);
+  float a[6] = float[6](${[' + ', ' - '].flatMap((sign) => ['e.x, 0, 0', '0, e.y, 0', '0, 0, e.z'].map((way) => `texture(v${k}, framed${k}(q${sign}vec3(${way}))).r`)).join(', ')});
   for (int i = 0; i < 6; i++) if (f${k}.x + f${k}.y * a[i] < -0.5) return vec3(0.0);
   vec3 rise = vec3(a[0] - a[3], a[1] - a[4], a[2] - a[5]);
   return all(lessThan(abs(rise), vec3(${FLAT * one}))) ? vec3(0.0) : (rise * n${k} * f${k}.y) * mat3(m${k});
@@ -248,11 +253,15 @@ export function raycaster(facts, gridsOf, { app }) {
     ray('1i', 'piece', masked());
     put('1i', 'sums', 1);
     put('1i', 'older', 0);
+    const part = (grid, at) => at.map((x, c) => (x + 0.5) / grid.dims[c]), voxel = (grid, at) => at.map((x, c) => x * grid.dims[c] - 0.5);
+    const matrix = (to) => { const o = to([0, 0, 0]); return [...AXES.flatMap((e) => [...minus(to(e), o), 0]), ...o, 1]; };
     for (const { k, grid, scale } of drawn) {
-      const inside = (p) => index(grid, p).map((x, c) => (x + 0.5) / grid.dims[c]), o = inside([0, 0, 0]);
+      const between = (from, to) => matrix((at) => part(to, index(to, place(from, voxel(from, at)))));
       ray('1i', `v${k}`, 2 + 2 * k);
       ray('1i', `b${k}`, 3 + 2 * k);
-      ray('Matrix4fv', `m${k}`, false, [...AXES.flatMap((e) => [...minus(inside(e), o), 0]), ...o, 1]);
+      ray('Matrix4fv', `m${k}`, false, matrix((p) => part(grid, index(grid, p))));
+      if (k) ray('Matrix4fv', `g${k}`, false, between(grids[0], grid));
+      if (k) ray('Matrix4fv', `h${k}`, false, between(grid, grids[0]));
       ray('3f', `n${k}`, ...grid.dims);
       ray('3f', `f${k}`, ...scale, 2 * ROWS * k);
     }
