@@ -1,7 +1,8 @@
 """Errors that users meet; each message says what was read, what was expected, and what to try."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 
 def pip_install(extra: str) -> str:
@@ -29,6 +30,15 @@ class DataError(VvgtError):
     """A file or an array with unexpected content (exit status 1)."""
 
     exit_code = 1
+
+
+@contextmanager
+def naming(what: str) -> Iterator[None]:
+    """Put ``what`` in front of every `DataError` of the block that does not begin with it."""
+    try:
+        yield
+    except DataError as error:
+        raise error if str(error).startswith(what) else DataError(f"{what}: {error}") from None
 
 
 class DeviceFailed(DataError):

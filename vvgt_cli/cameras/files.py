@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.cameras.types import Camera, quaternion
-from vvgt_cli.errors import DataError
+from vvgt_cli.errors import DataError, naming
 from vvgt_cli.files import read_text
 
 OPENGL = np.diag([1.0, -1.0, -1.0])  # camera axes OpenCV <-> OpenGL
@@ -164,13 +164,9 @@ def _camera(entry: dict[str, Any], name: str, index: int, size: int | None) -> C
     if not stem.isprintable() or "\\" in stem:  # it becomes the name of a file
         raise DataError(f"{name}: image {stem!r}; expected a plain file name")
     rotation, translation = opengl_to_pose(matrix)
-    try:
+    with naming(name):
         camera = Camera(rotation, translation, fx, fy, cx, cy, width, height, stem)
-    except DataError as error:
-        raise DataError(f"{name}: {error}") from None
-    if size is None or size == height:
-        return camera
-    return camera.resized(size / height)
+    return camera if size is None or size == height else camera.resized(size / height)
 
 
 def _matrix(value: Any, name: str) -> np.ndarray:

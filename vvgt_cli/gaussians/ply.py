@@ -11,7 +11,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.errors import DataError, UsageError, naming
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians.frames import rescale, turn, up_matrix
 from vvgt_cli.gaussians.header import MAX_BYTES, REQUIRED, FileFacts, PlyHeader, comment_lines, parse_header, rest_names
@@ -242,7 +242,7 @@ def read_ply(source: str | Path | BinaryIO) -> tuple[Gaussians, PlyHeader]:
     def columns(*names: str) -> np.ndarray:
         return np.stack([rows[n] for n in names], axis=-1).astype(np.float32)
 
-    try:
+    with naming(str(name)):
         gaussians = Gaussians(
             columns("x", "y", "z"),
             columns("scale_0", "scale_1", "scale_2"),
@@ -252,8 +252,6 @@ def read_ply(source: str | Path | BinaryIO) -> tuple[Gaussians, PlyHeader]:
             _harmonics(columns(*rest_names(header.sh_degree))) if header.sh_degree else None,
             _values(header, columns),
         )
-    except DataError as error:
-        raise DataError(f"{name}: {error}") from None
     _check_rotations(gaussians, str(name))
     return gaussians, header
 

@@ -153,11 +153,6 @@ def rgb(what: str, value: Any) -> tuple[float, float, float]:
     return red, green, blue
 
 
-def named(what: str, error: DataError) -> DataError:
-    """Return the same error with the file's name in front."""
-    return DataError(f"{what}: {error}")
-
-
 def _shown(value: Any) -> str:
     text = repr(value) if not isinstance(value, (list, dict)) else json.dumps(value, default=str)
     return text if len(text) <= 40 else text[:37] + "..."

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError
+from vvgt_cli.errors import DataError, naming
 from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
-from vvgt_cli.look.readers.fields import Elements, attribute, named
+from vvgt_cli.look.readers.fields import Elements, attribute
 
 REFERENCE_STEP = 1 / 150
 
@@ -41,7 +41,7 @@ def read(parsed: Elements, what: str, pick: str = "") -> TransferFunction:
             colors.append([attribute(f"{what}: rgba", attributes, key) for key in "xyzw"])
     if not places or len(places) != len(colors):
         raise DataError(f"{what}: {len(places)} positions and {len(colors)} colours; expected points with both")
-    try:
+    with naming(what):
         nodes, rgba = np.array(places), np.array(colors)
         masked = _masked(PiecewiseOpacity(nodes, rgba[:, 3]), facts["maskmin"], facts["maskmax"], facts["type"] == 0)
         return TransferFunction(
@@ -51,8 +51,6 @@ def read(parsed: Elements, what: str, pick: str = "") -> TransferFunction:
             domain="data" if facts["type"] else "fraction",
             opacity_unit_share=REFERENCE_STEP,
         )
-    except DataError as error:
-        raise named(what, error) from error
 
 
 def _masked(opacity: PiecewiseOpacity, lo: float, hi: float, fraction: bool) -> PiecewiseOpacity:

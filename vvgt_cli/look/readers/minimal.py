@@ -29,11 +29,11 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.errors import DataError, UsageError, naming
 from vvgt_cli.look.function import BY, PER_VOXEL, ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.isosurfaces import isosurfaces
 from vvgt_cli.look.lighting import COEFFICIENTS, Lighting, preset_lighting
-from vvgt_cli.look.readers.fields import named, number, rgb
+from vvgt_cli.look.readers.fields import number, rgb
 
 KEYS = {"name", "range", "points", "color_space", "hsv_wrap", "opacity_unit_distance", "opacity_unit_share"}
 KEYS |= {"lighting", "otherwise"}
@@ -72,7 +72,7 @@ def read(parsed: dict[str, Any], what: str, pick: str = "") -> TransferFunction:
     if not isinstance(wrap, bool):
         raise DataError(f"{what}: hsv_wrap {wrap!r}; expected true or false")
     (xo, y), (xc, c) = zip(*opacities, strict=True), zip(*colors, strict=True)
-    try:
+    with naming(what):
         if domain == "data" and hi > lo:
             if min(xo + xc) < 0 or max(xo + xc) > 1:
                 raise DataError(f"points x in [{min(xo + xc):g}, {max(xo + xc):g}]; with a range expected x in [0, 1]")
@@ -88,8 +88,6 @@ def read(parsed: dict[str, Any], what: str, pick: str = "") -> TransferFunction:
             lighting=_lighting(parsed.get("lighting"), what),
             otherwise=otherwise,
         )
-    except DataError as error:
-        raise named(what, error) from error
 
 
 def _otherwise(parsed: dict[str, Any], what: str) -> TransferFunction | None:

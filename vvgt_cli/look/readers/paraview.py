@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError
+from vvgt_cli.errors import DataError, naming
 from vvgt_cli.look.function import SPACES, ColorMap, PiecewiseOpacity, TransferFunction
-from vvgt_cli.look.readers.fields import Elements, attribute, named, rgb, table
+from vvgt_cli.look.readers.fields import Elements, attribute, rgb, table
 from vvgt_cli.volume.components import listed
 
 PRESET_KEYS = ("RGBPoints", "IndexedColors", "ColorSpace")
@@ -68,7 +68,7 @@ def read(parsed: Any, what: str, pick: str = "") -> TransferFunction:
         opacity_nodes = np.array([[colors[:, 0].min(), 0.0], [colors[:, 0].max(), 1.0]])
         name += RAMP
     nan_color = rgb(f"{what}: NanColor", preset["NanColor"]) if "NanColor" in preset else (0.5, 0.0, 0.0)
-    try:
+    with naming(what):
         return TransferFunction(
             name,
             PiecewiseOpacity(*opacity_nodes.T),
@@ -81,8 +81,6 @@ def read(parsed: Any, what: str, pick: str = "") -> TransferFunction:
                 nan_color=nan_color,
             ),
         )
-    except DataError as error:
-        raise named(what, error) from error
 
 
 def _of_xml(parsed: Elements, what: str) -> list[dict[str, Any]]:

@@ -19,11 +19,11 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError
+from vvgt_cli.errors import DataError, naming
 from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.lighting import Lighting, preset_lighting
 from vvgt_cli.look.readers import paraview
-from vvgt_cli.look.readers.fields import Elements, Lines, floats, named, number, rgb
+from vvgt_cli.look.readers.fields import Elements, Lines, floats, number, rgb
 
 UNIT_DISTANCE = 1.0  # vtkVolumeProperty's
 DEFAULT = "VTK's default"  # what that distance is called
@@ -47,7 +47,7 @@ def read(parsed: Any, what: str, pick: str = "") -> TransferFunction:
     several = isinstance(parsed, list | Elements) or "colorTransfer" in getattr(parsed, "keys", dict)()
     if pick and not several:
         raise DataError(f"{what}: holds one function, no presets; omit #{pick}")
-    try:
+    with naming(what):
         if isinstance(parsed, Lines):
             if len(parsed.items) < 9:
                 raise DataError(f"{len(parsed.items)} lines of numbers; expected the nine of a volume property (.vp)")
@@ -63,8 +63,6 @@ def read(parsed: Any, what: str, pick: str = "") -> TransferFunction:
         preset = paraview.choose([{**p, "Name": p.get("name", "")} for p in nodes], what, pick)
         shown = f"{what}#{pick}" if pick else what
         return _of_fields(str(preset["Name"]) or "volume property", preset, shown)
-    except DataError as error:
-        raise error if str(error).startswith(what) else named(what, error) from error
 
 
 def _counted(what: str, line: str, width: int) -> np.ndarray:
