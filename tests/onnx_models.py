@@ -1,5 +1,6 @@
 """Models in the form of `vvgt export`, built by hand: what they compute is known, and no torch is needed."""
 
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -66,7 +67,7 @@ def write_card(folder: Path, config=TINY):
     graphs = {
         name: graph_record(folder / f"{name}.onnx", *names(folder / f"{name}.onnx")) for name in ("image", "geometry")
     }
-    card = ModelCard(folder.name, config.to_dict(), 0, {}, "unknown", {}, 20, "float32", 0.0, graphs)
+    card = ModelCard(folder.name, asdict(config), 0, {}, "unknown", {}, 20, "float32", 0.0, graphs)
     (folder / CARD).write_text(card.to_json(), "utf-8")
 
 

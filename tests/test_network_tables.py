@@ -1,6 +1,6 @@
 """Curves, windows, pooling and neighbours against plain Python; what the network is given, against the cameras."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -153,7 +153,7 @@ def test_an_output_that_changes_nothing_gives_the_gaussians_back_in_their_order(
     ],
 )
 def test_a_config_that_makes_no_network_is_refused(change, message):
-    values = SMALL.to_dict()
+    values = asdict(SMALL)
     change(values)
     refused(DataError, message, NetworkConfig.from_dict, values)
 

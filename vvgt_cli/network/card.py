@@ -30,7 +30,7 @@ class ModelCard:
 
     Attributes:
         name: of the folder.
-        config: of the network, `NetworkConfig.to_dict`.
+        config: of the network, `NetworkConfig` as a dictionary.
         parameters: number of learned values.
         training: data and settings of the training; from the checkpoint.
         commit: of the program that trained it.

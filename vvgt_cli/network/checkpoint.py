@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,7 @@ class NetworkCheckpoint:
         return {
             "format": FORMAT,
             "schema": SCHEMA,
-            "config": self.network.config.to_dict(),
+            "config": asdict(self.network.config),
             "state": self.network.state_dict(),
             "training": self.training,
             "metrics": self.metrics,

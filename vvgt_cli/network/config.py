@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 from vvgt_cli.errors import DataError, UsageError
@@ -167,13 +167,9 @@ class NetworkConfig:
         """Return the method of `vvgt_cli.closed_form` whose Gaussians training starts from."""
         return "uniform" if self.variant == "wo_vbm" else "moments"
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values, as checkpoints and model cards store them."""
-        return asdict(self)
-
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> NetworkConfig:
-        """Return the configuration of the values of `to_dict`; raise DataError for missing, unknown or invalid ones."""
+        """Return the configuration of `dataclasses.asdict`; raise DataError for missing, unknown or invalid ones."""
         sides = {"image": ImageConfig, "geometry": GeometryConfig}
         try:
             known = {name: _exactly(side, values[name]) for name, side in sides.items()}

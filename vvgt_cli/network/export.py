@@ -12,7 +12,7 @@ import tempfile
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -239,7 +239,7 @@ def export_model(
             f"{checkpoint}: variant {variant} has no 3D side to refine Gaussians with; it runs in torch only"
         )
     card = ModelCard(
-        target.name, network.config.to_dict(), sum(p.numel() for p in network.parameters()), loaded.training,
+        target.name, asdict(network.config), sum(p.numel() for p in network.parameters()), loaded.training,
         loaded.commit, loaded.metrics, OPSET, storage, 0.0,
     )  # fmt: skip
     moves = any(parameter.any() for parameter in network.geometry.head.last.parameters())

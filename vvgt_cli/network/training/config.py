@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -162,10 +163,6 @@ class TrainConfig:
         if not self.network.has_geometry and self.loss.decibel:
             raise UsageError("loss.decibel compares with the Gaussians given; the variant wo_3dt gets none")
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values."""
-        return asdict(self)
-
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> TrainConfig:
         """Return the defaults updated by ``values``; ``network`` may be the name of a configuration.
@@ -213,15 +210,8 @@ def read_config(path: str | Path) -> TrainConfig:
 
 def config_text(config: TrainConfig) -> str:
     """Return the YAML that `read_config` reads."""
-    plain = lists(config.to_dict())
+    plain = json.loads(json.dumps(asdict(config)))  # YAML's safe form has no tuples
     return str(_yaml().safe_dump(plain, sort_keys=False))
-
-
-def lists(value: Any) -> Any:
-    """Replace tuples by lists: YAML's safe form has no tuples."""
-    if isinstance(value, dict):
-        return {key: lists(entry) for key, entry in value.items()}
-    return [lists(entry) for entry in value] if isinstance(value, tuple | list) else value
 
 
 def _yaml() -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import math
 import os
 import signal
@@ -20,9 +21,10 @@ from torch import Tensor, distributed, nn
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
+from vvgt_cli.gaussians.outputs import check_folder, write_text
 from vvgt_cli.network.checkpoint import NetworkCheckpoint, load_weights, read_tensors, save_checkpoint
 from vvgt_cli.network.model import Vvgt
-from vvgt_cli.network.training.config import TrainConfig, config_text, lists, read_config
+from vvgt_cli.network.training.config import TrainConfig, config_text, read_config
 from vvgt_cli.network.training.lpips import Lpips, load_lpips
 from vvgt_cli.network.training.sample import Feeder, accumulate_gradients, score_scene
 from vvgt_cli.network.training.scenes import TrainingScene, make_scenes, prepare_scenes
@@ -77,10 +79,7 @@ def train(config: TrainConfig, data: str, output: str, console: Console, ended: 
 
 def _open_run(folder: Path, config: TrainConfig) -> None:
     """Create the folder and its configuration, or check that the existing run has the same one."""
-    if not folder.parent.is_dir():
-        raise UsageError(f"-o {folder}: the folder {folder.parent} does not exist; make it first")
-    if folder.exists() and not folder.is_dir():
-        raise UsageError(f"-o {folder}: is a file; expected a folder for the run")
+    check_folder(folder, "run")
     folder.mkdir(exist_ok=True)
     place = folder / CONFIG
     if place.exists():
@@ -89,8 +88,7 @@ def _open_run(folder: Path, config: TrainConfig) -> None:
         return
     if any(folder.iterdir()):
         raise UsageError(f"-o {folder}: is not empty and holds no run; give another folder")
-    with atomic_write(place) as temporary:
-        temporary.write_text(config_text(config), "utf-8")
+    write_text(place, config_text(config), overwrite=False)
 
 
 def rate(step: int, config: TrainConfig) -> float:
@@ -205,12 +203,13 @@ class _Run:
             return
         state = self.progress
         training = {
-            "config": {key: value for key, value in self.config.to_dict().items() if key != "network"},
+            "config": {key: value for key, value in asdict(self.config).items() if key != "network"},
             "data": Path(self.data).name, "scenes": {part: len(scenes) for part, scenes in self.scenes.items()},
             "step": state.step, "skipped": state.skipped, "seconds": round(state.seconds, 1),
             "processes": self.here.size, "device": self.here.device.type, "torch": str(torch.__version__),
         }  # fmt: skip
-        checkpoint = NetworkCheckpoint(self.network, lists(training), lists(state.scores), self.commit)
+        training = json.loads(json.dumps(training))  # as model cards hold it, without tuples
+        checkpoint = NetworkCheckpoint(self.network, training, state.scores, self.commit)
         with atomic_write(self.folder / name, overwrite=True) as temporary:
             save_checkpoint(temporary, checkpoint, more)
 

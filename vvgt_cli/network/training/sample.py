@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import math
-from collections import OrderedDict
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -46,20 +46,10 @@ class Feeder:
         """Keep up to ``config.keep`` inputs of ``scenes``."""
         self.scenes, self.config = scenes, config
         self.plain = Vvgt(config.network).eval()  # on the host
-        self.kept: OrderedDict[tuple[int, int, int], tuple[Prepared, dict[str, Tensor]]] = OrderedDict()
+        self.give = lru_cache(config.keep)(self._made)
 
-    def give(self, scene: int, views: int, number: int) -> tuple[Prepared, dict[str, Tensor]]:
+    def _made(self, scene: int, views: int, number: int) -> tuple[Prepared, dict[str, Tensor]]:
         """Return the input of round ``number`` of a scene, with its view set ``views``."""
-        key = (scene, views, number)
-        if key not in self.kept:
-            prepared = self._make(*key)
-            self.kept[key] = prepared, tensors_of(prepared.arrays())
-            if len(self.kept) > self.config.keep:
-                self.kept.popitem(last=False)
-        self.kept.move_to_end(key)
-        return self.kept[key]
-
-    def _make(self, scene: int, views: int, number: int) -> Prepared:
         rounds, source = self.config.network.rounds, self.scenes[scene]
         rng = np.random.default_rng([self.config.seed, scene, views])
         chosen = [int(i) for i in rng.permutation(len(source.cameras))[: self.config.network.total_views]]
@@ -70,7 +60,8 @@ class Feeder:
                 gaussians = before.restore(run_network(self.plain, inputs, torch.device("cpu")).numpy())
         shown = views_of_round(chosen, number, rounds)
         cameras = [source.cameras[i] for i in shown]
-        return prepare(gaussians, cameras, as_float(source.images[shown]), self.config.network)
+        prepared = prepare(gaussians, cameras, as_float(source.images[shown]), self.config.network)
+        return prepared, tensors_of(prepared.arrays())
 
 
 def accumulate_gradients(
