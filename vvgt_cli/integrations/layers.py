@@ -12,13 +12,12 @@ import numpy as np
 
 from vvgt_cli.commands.convert import convert
 from vvgt_cli.conversion.result import Conversion
+from vvgt_cli.dvr.layers import MAX_FINER, SAME
 from vvgt_cli.field.layered import OpenedFile
 from vvgt_cli.library.inputs import LightLike, Look, source_of
 from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.volume import Volume, triple
 
-FINER = 8  # times as fine as the first volume a layer may be
-SLACK = 1e-3  # voxels
 AROUND = "around"  # name of an empty volume that holds all
 
 Layer = tuple[OpenedFile, Look]
@@ -47,10 +46,10 @@ def _ordered(layers: Sequence[Layer]) -> list[Layer]:
     everything = np.concatenate(corners)
     for k, v in enumerate(volumes):
         index = (everything - v.origin) @ np.linalg.inv(v.axes).T / v.spacing
-        if (index > -0.5 - SLACK).all() and (index < np.array(v.dims) - 0.5 + SLACK).all():
+        if (index > -0.5 - SAME).all() and (index < np.array(v.dims) - 0.5 + SAME).all():
             return [layers[k], *layers[:k], *layers[k + 1 :]]
     low, high = everything.min(axis=0), everything.max(axis=0)
-    dims = np.ceil((high - low) / (FINER * min(min(v.spacing) for v in volumes))).astype(int)
+    dims = np.ceil((high - low) / (MAX_FINER * min(min(v.spacing) for v in volumes))).astype(int)
     step = (high - low) / dims
     empty = np.zeros(dims[::-1], np.uint8)
     around = Volume(

@@ -22,8 +22,7 @@ from vvgt_cli.integrations.vtk_scene import Drawn, drawn
 from vvgt_cli.integrations.vtk_view import camera_of, lights_of, volumes_of
 from vvgt_cli.library.inputs import Look, Reading, volume_of
 from vvgt_cli.look import LightOptions, read_transfer_function
-
-COEFFICIENTS = ("ambient", "diffuse", "specular", "specular_power")
+from vvgt_cli.look.lighting import COEFFICIENTS
 
 
 def export_plotter(plotter: Any, path: str | os.PathLike[str], *, overwrite: bool = True, **options: Any) -> Conversion:
