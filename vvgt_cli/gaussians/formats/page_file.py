@@ -30,6 +30,7 @@ from vvgt_cli.gaussians.formats.splats import Splats, morton_order
 from vvgt_cli.gaussians.frames import up_matrix
 from vvgt_cli.gaussians.header import facts_in
 from vvgt_cli.gaussians.rules import INRIA, RULES
+from vvgt_cli.gaussians.types import HARMONICS
 
 PROGRAM = "viewer.js.gz"
 _SPLATS = re.compile(rb'<script type="application/octet-stream" id="splats-\d+">([A-Za-z0-9+/=]+)</script>')
@@ -50,10 +51,8 @@ _RAISED, _TILTED = 0.1, 0.364  # height of the eye before a face, and beside oth
 def page_bytes(degree: int) -> tuple[float, float]:
     """Return the most bytes of a page without Gaussians and values, and of each Gaussian with harmonics of a degree."""
     header = sum(len(asset(name)) for name in ("page.html", "page.css", "inflate.js")) + TEXTS
-    packed, harmonics = 16 + 72 / 256, {0: 0, 1: 9, 2: 24, 3: 45}[degree]  # of a .compressed.ply: chunks of 256
-    return header + (len(asset(PROGRAM)) + 2 * 4096) * 4 / 3, (
-        packed + harmonics
-    ) * 4 / 3  # base64; headers and what gzip adds
+    packed = 16 + 72 / 256 + 3 * HARMONICS[degree]  # of a .compressed.ply: chunks of 256
+    return header + (len(asset(PROGRAM)) + 2 * 4096) * 4 / 3, packed * 4 / 3  # base64; headers and what gzip adds
 
 
 def asset(name: str) -> bytes:

@@ -11,7 +11,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, as_ply, read_ply
-from vvgt_cli.gaussians.header import parse_header
+from vvgt_cli.gaussians.header import parse_header, rest_names
 from vvgt_cli.gaussians.ply import property_names
 from vvgt_cli.gaussians.types import HARMONICS
 
@@ -77,7 +77,7 @@ def columns_of(content: bytes, name: str) -> Splats:
     def columns(*names: str) -> np.ndarray:
         return np.stack([rows[name] for name in names], axis=-1)
 
-    rest = [f"f_rest_{k}" for k in range(3 * HARMONICS[header.sh_degree])]
+    rest = rest_names(header.sh_degree)
     f_rest = columns(*rest) if rest else np.zeros((header.count, 0), np.float32)
     quaternions = columns("rot_0", "rot_1", "rot_2", "rot_3").astype(np.float64)
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
