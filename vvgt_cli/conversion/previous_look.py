@@ -11,6 +11,7 @@ import numpy as np
 from vvgt_cli.conversion.live import box_lighting, function_table
 from vvgt_cli.conversion.place import to_box_frame
 from vvgt_cli.conversion.plan import Plan, WarmStart
+from vvgt_cli.conversion.recolored import lit
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.conversion.stage import Work
@@ -131,14 +132,12 @@ def recolor_earlier(earlier: Conversion, field: Field) -> Gaussians:
 
 def _look_alone(look: StyledVolume, gaussians: Gaussians, samples: np.ndarray) -> tuple[Gaussians, np.ndarray]:
     """Return Gaussians with the colours of a look at ``samples`` (K, 8), and (K,) extinctions."""
-    from vvgt_cli.closed_form.lit import relight
-
     sums = function_table(look).of(samples)
     tau = sums[:, TAU]
     plain = replace(gaussians, colors=sums[:, :TAU] / np.maximum(tau, 1e-30)[:, None], harmonics=None)
-    lighting, gradient = box_lighting(look), samples[:, GRADIENT].astype(np.float64)
+    gradient = samples[:, GRADIENT].astype(np.float64)
     normals = gradient / np.maximum(np.linalg.norm(gradient, axis=1), 1e-30)[:, None]
-    return (plain if lighting is None else relight(plain, normals, lighting)), tau
+    return lit(plain, normals, box_lighting(look)), tau
 
 
 def _same_volume(field: Field, other: Field) -> bool:
