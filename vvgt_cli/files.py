@@ -159,6 +159,12 @@ def atomic_write(path: str | os.PathLike[str], overwrite: bool = False) -> Itera
         _leftovers.discard(temporary)
 
 
+def write_bytes(path: str | os.PathLike[str], content: bytes, overwrite: bool) -> int:
+    """Write a file and return its number of bytes; errors: `atomic_write`."""
+    with atomic_write(path, overwrite) as temporary:
+        return temporary.write_bytes(content)
+
+
 def write_arrays(path: str | os.PathLike[str], arrays: np.ndarray | dict[str, Any]) -> None:
     """Write an array as .npy, or several by name as .npz, in place of a file at ``path``; errors: `atomic_write`."""
     import numpy as np

@@ -13,7 +13,7 @@ import numpy as np
 from vvgt_cli.conversion.index import FRAMES, entry, index_output, is_pattern, put_name, shown_name, write_index
 from vvgt_cli.conversion.result import Result
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.files import atomic_write
+from vvgt_cli.files import write_bytes
 from vvgt_cli.gaussians.formats import SUFFIXES, format_of, is_page
 from vvgt_cli.gaussians.formats.nodes import Node
 from vvgt_cli.gaussians.formats.page_look import contents, page_of_several
@@ -126,9 +126,7 @@ class Clouds(Mapping[str, Result]):
             check_outputs([Output("save", name, SUFFIXES, splats=True)], [], overwrite)
             if odd := sorted(set(how) - {"frame", "up", "sh_degree", "comments"}):
                 raise UsageError(f"{name}: {', '.join(odd)}: not for one file of several clouds")
-            content = known.write_nodes(self.nodes(**how), name)
-            with atomic_write(name, overwrite) as temporary:
-                return temporary.write_bytes(content)
+            return write_bytes(name, known.write_nodes(self.nodes(**how), name), overwrite)
         if not is_pattern(name):
             suffix = known.suffix if known else Path(name).suffix
             name = f"{name[: len(name) - len(suffix)]}_{{}}{suffix}"
@@ -183,8 +181,7 @@ class Clouds(Mapping[str, Result]):
         if how:
             raise UsageError(f"{path}: a page shows the unit frame unchanged; remove {', '.join(how)}")
         told = None if story is None else read_story(story).checked((), len(self.clouds))
-        with atomic_write(path, overwrite) as temporary:
-            return temporary.write_bytes(self._html(path, told))
+        return write_bytes(path, self._html(path, told), overwrite)
 
     def _html(self, name: str, story: Story | None = None) -> bytes:
         """Return one page of all clouds."""

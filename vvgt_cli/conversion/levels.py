@@ -19,7 +19,7 @@ from vvgt_cli.conversion.cut import Levels, StoredGaussians
 from vvgt_cli.conversion.level_selection import CutErrors
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.digests import digest
-from vvgt_cli.files import atomic_write
+from vvgt_cli.files import atomic_write, write_bytes
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats.page_file import upright
 from vvgt_cli.gaussians.formats.sog import IMAGES, META, images_of, webp
@@ -257,11 +257,5 @@ def _written(target: Path, splats: Splats) -> int:
     for name in IMAGES:
         if f"{name}.webp" not in images:  # of earlier levels, which had harmonics
             target.with_name(f"{name}.webp").unlink(missing_ok=True)
-    size = sum(_put(target.with_name(name), webp(image)) for name, image in images.items())
-    return size + _put(target, json.dumps(meta, separators=(",", ":")).encode())
-
-
-def _put(path: Path, content: bytes) -> int:
-    with atomic_write(path, overwrite=True) as temporary:
-        temporary.write_bytes(content)
-    return len(content)
+    size = sum(write_bytes(target.with_name(name), webp(image), overwrite=True) for name, image in images.items())
+    return size + write_bytes(target, json.dumps(meta, separators=(",", ":")).encode(), overwrite=True)

@@ -15,7 +15,7 @@ import numpy as np
 from vvgt_cli.cameras.files import read_frames
 from vvgt_cli.cameras.types import Camera
 from vvgt_cli.errors import DataError
-from vvgt_cli.files import atomic_write
+from vvgt_cli.files import atomic_write, write_bytes
 from vvgt_cli.volume.blocks import check_memory
 
 SUFFIXES = (".exr", ".png")  # the first that exists is read
@@ -193,9 +193,7 @@ def write_png(path: str | PathLike[str], image: np.ndarray, overwrite: bool = Fa
         DataError: the shape is wrong, or the file cannot be written.
         UsageError: the file exists and ``overwrite`` is not set.
     """
-    encoded = png_bytes(image)
-    with atomic_write(path, overwrite) as temporary:
-        temporary.write_bytes(encoded)
+    write_bytes(path, png_bytes(image), overwrite)
 
 
 def png_bytes(image: np.ndarray) -> bytes:
