@@ -41,8 +41,8 @@ def scene_light(
         sky = sky_of(lighting.sky, np.array(lighting.directions[0]), axes)
         shade, traced, directions = light_grid(matter(), sky, shape, cell), 1, np.zeros((0, 3))
     else:
-        inward = np.linalg.inv(axes)
-        directions = np.array([_unit(inward @ np.array(d)) for d in lighting.directions]).reshape(-1, 3)
+        inward = [np.linalg.inv(axes) @ np.array(d) for d in lighting.directions]
+        directions = np.array([d / np.linalg.norm(d) for d in inward]).reshape(-1, 3)
     return Light(
         float(lighting.ambient), float(lighting.diffuse), float(lighting.specular), float(lighting.specular_power),
         int(lighting.headlight), np.ascontiguousarray(directions), shade, traced, 1.0 / cell,
@@ -65,7 +65,3 @@ def sphere(count: int) -> np.ndarray:
     turn = math.pi * (3 - math.sqrt(5)) * n
     across = np.sqrt(1 - z * z)
     return np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1)
-
-
-def _unit(vector: np.ndarray) -> np.ndarray:
-    return vector / np.linalg.norm(vector)

@@ -10,6 +10,7 @@ import numpy as np
 from vvgt_cli.errors import DataError
 
 BLACK = (0.0, 0.0, 0.0)
+GAP = 4  # pixels between the pictures of a contact sheet
 
 
 def over(rgba: np.ndarray, background: float | Sequence[float] | np.ndarray = BLACK) -> np.ndarray:
@@ -29,6 +30,12 @@ def _rgb(image: np.ndarray, background: Sequence[float]) -> np.ndarray:
     if image.ndim != 3 or image.shape[2] not in (3, 4):
         raise DataError(f"image of shape {image.shape}; expected (height, width, 3) or (height, width, 4)")
     return np.clip(over(image, background) if image.shape[2] == 4 else image, 0, 1)
+
+
+def coarser(image: np.ndarray, factor: int) -> np.ndarray:
+    """Return an image (h, w, c) averaged over squares of ``factor`` pixels, without the rest at the right and below."""
+    h, w = image.shape[0] // factor, image.shape[1] // factor
+    return image[: h * factor, : w * factor].reshape(h, factor, w, factor, -1).mean(axis=(1, 3))
 
 
 def side_by_side(reference: np.ndarray, ours: np.ndarray, gain: float = 8.0) -> np.ndarray:
@@ -66,28 +73,23 @@ def captioned(sheet: np.ndarray, rows: int) -> np.ndarray:
     return np.concatenate(parts)
 
 
-def contact_sheet(
-    images: Sequence[np.ndarray], columns: int | None = None, gap: int = 4, background: Sequence[float] = BLACK
-) -> np.ndarray:
-    """Lay images of one size out in rows, ``gap`` pixels apart, over ``background``, (H, W, 3) float32 in [0, 1].
+def contact_sheet(images: Sequence[np.ndarray], background: Sequence[float] = BLACK) -> np.ndarray:
+    """Lay images of one size out in rows, `GAP` pixels apart, over ``background``, (H, W, 3) float32 in [0, 1].
 
-    Images are (h, w, 3) RGB or (h, w, 4) premultiplied; ``columns`` is by default the square root of their number,
-    rounded up. Raise DataError for none, for other sizes, or ``columns`` below 1.
+    Images are (h, w, 3) RGB or (h, w, 4) premultiplied; a row has as many as there are rows, or one more. Raise
+    DataError for none, or other sizes.
     """
     tiles = [_rgb(image, background) for image in images]
     if not tiles or len({tile.shape for tile in tiles}) != 1:
         raise DataError(
             f"{len(tiles)} images of {len({t.shape for t in tiles})} sizes; expected at least one, one size"
         )
-    columns = math.ceil(math.sqrt(len(tiles))) if columns is None else columns
-    if columns < 1:
-        raise DataError(f"{columns} columns; expected at least one")
-    columns = min(columns, len(tiles))
+    columns = math.ceil(math.sqrt(len(tiles)))
     height, width, _ = tiles[0].shape
     rows = -(-len(tiles) // columns)
-    sheet = np.empty((rows * (height + gap), columns * (width + gap), 3), dtype=np.float32)
+    sheet = np.empty((rows * (height + GAP), columns * (width + GAP), 3), dtype=np.float32)
     sheet[:] = background
     for i, tile in enumerate(tiles):
-        y, x = i // columns * (height + gap), i % columns * (width + gap)
+        y, x = i // columns * (height + GAP), i % columns * (width + GAP)
         sheet[y : y + height, x : x + width] = tile
-    return sheet[: sheet.shape[0] - gap, : sheet.shape[1] - gap]
+    return sheet[: sheet.shape[0] - GAP, : sheet.shape[1] - GAP]

@@ -55,14 +55,14 @@ def apply_rope(x: Tensor, rope: tuple[Tensor, Tensor]) -> Tensor:
     return x * cos + torch.cat([-second, first], dim=-1) * sin
 
 
-def axial_rope(grid: int, special: int, width: int, base: float = 100.0) -> tuple[Tensor, Tensor]:
+def axial_rope(grid: int, special: int, width: int) -> tuple[Tensor, Tensor]:
     """Return cos and sin (special + grid^2, width) of a 2D rotary embedding.
 
     Pairs (i, i + width / 2) turn by the row for the first quarter of i, by the column for the second. Patches count
     from 1, the special tokens stand at (0, 0): VGGT's choice, and its base.
     """
     quarter = width // 4
-    rates = base ** -(torch.arange(quarter) / quarter)  # (width / 4,)
+    rates = 100.0 ** -(torch.arange(quarter) / quarter)  # (width / 4,)
     place = torch.arange(1, grid + 1, dtype=torch.float32)
     angle = place[:, None] * rates  # (grid, width / 4)
     rows = angle[:, None, :].expand(grid, grid, quarter)
