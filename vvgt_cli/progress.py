@@ -4,15 +4,24 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
-from typing import Any, TextIO
+from typing import Any, TextIO, TypeVar
 
+T = TypeVar("T")
 ProgressCallback = Callable[[int, int], None]
 _WIDTH = 24  # characters of a bar
 _INTERVAL = 0.1  # seconds between two drawings of a bar
 _LINES = 30.0  # seconds between two lines without a terminal
+
+
+def counted(items: Collection[T], progress: ProgressCallback | None) -> Iterator[T]:
+    """Yield items, and call ``progress(done, all)`` behind the work on each."""
+    for done, item in enumerate(items, 1):
+        yield item
+        if progress:
+            progress(done, len(items))
 
 
 class MessageStream:

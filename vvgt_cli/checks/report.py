@@ -12,7 +12,7 @@ import numpy as np
 from vvgt_cli.cameras import default_views
 from vvgt_cli.checks import Case, Outcome, run_case
 from vvgt_cli.dvr import RenderSettings, Scene, render_view
-from vvgt_cli.progress import Console, ProgressCallback
+from vvgt_cli.progress import Console, ProgressCallback, counted
 from vvgt_cli.score.record import document
 
 STEPS = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125, 0.0625)  # voxels
@@ -85,14 +85,9 @@ def _stiffness_lines(result: Stiffness) -> list[str]:
 def run_cases(cases: list[Case], console: Console) -> list[Outcome]:
     """Run cases, with a line on the console for each stage."""
     outcomes: list[Outcome] = []
-    bar = console.bar("check")
-    for stage, group in groupby(cases, lambda case: case.stage):
-        begin = len(outcomes)
-        for case in group:
-            outcomes.append(run_case(case))
-            if bar:
-                bar(len(outcomes), len(cases))
-        done = outcomes[begin:]
+    for stage, group in groupby(counted(cases, console.bar("check")), lambda case: case.stage):
+        done = [run_case(case) for case in group]
+        outcomes += done
         failed = sum(not o.passed for o in done)
         console.stage(stage, sum(o.seconds for o in done), f"{len(done)} cases, {failed or 'none'} failed")
     return outcomes

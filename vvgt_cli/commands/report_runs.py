@@ -33,10 +33,10 @@ from vvgt_cli.gaussians import Gaussians, as_stored, read_ply, write_ply
 from vvgt_cli.gaussians.frames import transform
 from vvgt_cli.gaussians.outputs import STDOUT, Output, check_folder, check_outputs, write_text
 from vvgt_cli.gaussians.rules import INRIA
-from vvgt_cli.images import png_bytes
+from vvgt_cli.images import coarser, png_bytes
 from vvgt_cli.jit.ahead import INIT
 from vvgt_cli.network.card import SHIPPED, find_model
-from vvgt_cli.progress import Console
+from vvgt_cli.progress import Console, counted
 from vvgt_cli.refine import OptimizeOptions
 from vvgt_cli.score.charts import FILES, draw, write_plots
 from vvgt_cli.score.curves import (
@@ -137,11 +137,8 @@ class Reference:
         views, around = RememberedViews(size, volume.views), condition_pictures(screens(size), SIDE)
         scored = [Picture(camera, REFERENCE, blocks) for _, camera, blocks in scored_views(size)]
         volume.views.expect([*scored, *(Picture(camera, REFERENCE, part) for _, camera, part in around)])
-        bar = console.bar("reference")
-        for done, picture in enumerate(scored, 1):
+        for picture in counted(scored, console.bar("reference")):
             views.view(*picture)
-            if bar:
-                bar(done, len(scored))
         conditions = list(condition_views(volume.views, around, REFERENCE))
         return cls(views, size, volume.source.volume.axes, conditions)
 
@@ -175,10 +172,7 @@ class Reference:
         see, shown = render_in_box(draw, self.axes), []
         for n in PICTURED:
             image = np.clip(see(default_views("test", size=self.size)[n])[..., :3], 0, 1)
-            factor = -(-self.size // limit)
-            side = self.size // factor
-            squares = image[: side * factor, : side * factor].reshape(side, factor, side, factor, 3)
-            shown.append(png_bytes(squares.mean(axis=(1, 3))))
+            shown.append(png_bytes(coarser(image, -(-self.size // limit))))
         return shown
 
 

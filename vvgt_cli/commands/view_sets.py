@@ -30,13 +30,13 @@ from vvgt_cli.field.field import Field, Picture, Resident
 from vvgt_cli.field.open import FieldNeeds, store_beside
 from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.field.source import SourceRequest, StyledVolume
-from vvgt_cli.files import atomic_write, claim
+from vvgt_cli.files import claim, write_bytes
 from vvgt_cli.gaussians.outputs import check_folder
-from vvgt_cli.images import as_png, contact_sheet, over, write_exr, write_png
+from vvgt_cli.images import as_png, coarser, contact_sheet, over, write_exr, write_png
 from vvgt_cli.images.files import read_view
 from vvgt_cli.jit.ahead import RAYCAST, VIEWS
 from vvgt_cli.library.inputs import PathLike
-from vvgt_cli.progress import Console
+from vvgt_cli.progress import Console, counted
 from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.version import VERSION
 from vvgt_cli.volume.types import IDENTITY
@@ -165,13 +165,6 @@ def start_points(field: Field, size: int) -> tuple[np.ndarray, np.ndarray]:
     return points @ field.source.volume.axes.T, np.clip(gaussians.colors, 0, 1)
 
 
-def thumbnail(image: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return a camera's ``image`` (h, w, 4) float32, averaged down to at most `THUMBNAIL` pixels a side."""
-    factor = _factor(camera)
-    h, w = image.shape[0] // factor, image.shape[1] // factor
-    return image[: h * factor, : w * factor].reshape(h, factor, w, factor, 4).mean(axis=(1, 3))
-
-
 def thumbnails(
     folder: Path, views: Sequence[View], background: Sequence[float], known: Mapping[str, np.ndarray]
 ) -> np.ndarray:
@@ -185,7 +178,7 @@ def thumbnails(
     for view in views:
         small = known.get(view.stem)
         if small is None:
-            small = thumbnail(read_view(folder / view.stem), view.camera)
+            small = coarser(read_view(folder / view.stem), _factor(view.camera))
         h, w = small.shape[:2]
         tile = np.zeros((height, width, 4), np.float32)
         top, left = (height - h) // 2, (width - w) // 2
@@ -195,6 +188,7 @@ def thumbnails(
 
 
 def _factor(camera: Camera) -> int:
+    """Return by how much a camera's pictures are averaged down to at most `THUMBNAIL` pixels a side."""
     return min(-(-max(camera.width, camera.height) // THUMBNAIL), camera.width, camera.height)
 
 
@@ -473,16 +467,13 @@ def _render(run: Run, one: _Set, draw: Draw) -> None:
         for left in path.parent.glob(f".{path.stem}.{'[0-9a-f]' * 8}{path.suffix}"):  # by a killed run
             left.unlink(missing_ok=True)
     with run.stage("views") as stage:
-        bar = run.console.bar("views")
         with ThreadPoolExecutor(1) as writer:  # compresses one view while the next is rendered
             written: Future[list[str]] = writer.submit(list)
             try:
-                for done, view in enumerate(one.pending, 1):
+                for view in counted(one.pending, run.console.bar("views")):
                     image = draw(view.camera)
                     one.manifest.record(written.result())
                     written = writer.submit(_keep, one, view, image)
-                    if bar:
-                        bar(done, len(one.pending))
             finally:
                 one.manifest.record(written.result())
         camera = one.pending[0].camera
@@ -491,7 +482,7 @@ def _render(run: Run, one: _Set, draw: Draw) -> None:
 
 def _keep(one: _Set, view: View, image: np.ndarray) -> list[str]:
     """Write a view's images, keep its thumbnail, and return the relative paths."""
-    one.small[view.stem] = thumbnail(one.layout.stored(image).astype(np.float32), view.camera)
+    one.small[view.stem] = coarser(one.layout.stored(image).astype(np.float32), _factor(view.camera))
     return one.layout.write(one.folder, view, image)
 
 
@@ -512,8 +503,7 @@ def _contact(run: Run, one: _Set) -> None:
 
 def _write(manifest: Manifest, files: dict[str, bytes]) -> None:
     for name, data in files.items():
-        with atomic_write(manifest.folder / name, overwrite=True) as temporary:
-            temporary.write_bytes(data)
+        write_bytes(manifest.folder / name, data, overwrite=True)
     manifest.record(files)
 
 

@@ -25,7 +25,7 @@ from vvgt_cli.gaussians.formats import is_page
 from vvgt_cli.look.label_files import table_for
 from vvgt_cli.look.labels import AUTO, NO_LABELS, LabelTable
 from vvgt_cli.network.card import CARD, find_model
-from vvgt_cli.progress import Console
+from vvgt_cli.progress import Console, counted
 from vvgt_cli.score.record import Run
 from vvgt_cli.version import VERSION
 from vvgt_cli.volume import ReadOptions, Statistics, Volume, statistics
@@ -235,8 +235,7 @@ def survey(
     first: OpenedFile | None = None
     stats, digests = [], []
     mapped, present = labels not in (None, NO_LABELS), set[int]()
-    bar = console.bar("range")
-    for k, step in enumerate(steps):
+    for k, step in enumerate(counted(steps, console.bar("range"))):
         content = open_content(step.volume, replace(step.read, stored=True, packed=True) if stored else step.read)
         if content.overlapping:
             raise UsageError(f"{step.name}: its segments overlap; convert such frames one by one")
@@ -250,8 +249,6 @@ def survey(
             present.update(labels_in(content.volumes[0]))
         stats.append([statistics(volume) for volume in content.classified])
         digests += [volume_digest(volume) for volume in content.volumes]
-        if bar:
-            bar(k + 1, len(steps))
     if first is None:
         raise UsageError("the series has no frames; expected one or more")
     whole = tuple(merge_statistics(rows) for rows in zip(*stats, strict=True))

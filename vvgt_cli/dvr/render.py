@@ -13,7 +13,7 @@ import numpy as np
 from vvgt_cli.cameras import Blocks, Camera
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.errors import UsageError
-from vvgt_cli.progress import ProgressCallback
+from vvgt_cli.progress import ProgressCallback, counted
 
 # Pixels that differ from a neighbour by more than this get that many rays.
 ADAPTIVE = ((0.08, 5), (0.3, 13))
@@ -181,9 +181,4 @@ def render_views(
     progress: ProgressCallback | None = None,
 ) -> np.ndarray:
     """Render views of one size: (n, height, width, 4) float32, premultiplied; ``progress(done, total)`` after each."""
-    images = []
-    for i, camera in enumerate(cameras):
-        images.append(render_view(scene, camera, settings))
-        if progress:
-            progress(i + 1, len(cameras))
-    return np.stack(images)
+    return np.stack([render_view(scene, camera, settings) for camera in counted(cameras, progress)])

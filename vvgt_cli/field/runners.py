@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Protocol, Self
 
 from vvgt_cli.errors import DataError, UsageError, pip_install
 from vvgt_cli.files import discard_leftovers
-from vvgt_cli.progress import ProgressCallback
+from vvgt_cli.progress import ProgressCallback, counted
 from vvgt_cli.resources import memory_limit
 
 if TYPE_CHECKING:
@@ -62,10 +62,8 @@ class Runner:
 
     def run(self, task: Task, numbers: Sequence[int], progress: ProgressCallback | None) -> None:
         """Process the blocks ``numbers``."""
-        for done, number in enumerate(numbers, 1):
+        for number in counted(numbers, progress):
             task(number)
-            if progress:
-                progress(done, len(numbers))
 
 
 def _start_worker(threads: int, alive: Connection) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from vvgt_cli.network import tables
 from vvgt_cli.network.card import IMAGE_INPUTS, MAPS, OUTPUT, ModelCard, read_card
 from vvgt_cli.network.config import NetworkConfig
 from vvgt_cli.network.prepare import Prepared, prepare
-from vvgt_cli.progress import ProgressCallback
+from vvgt_cli.progress import ProgressCallback, counted
 
 PROVIDERS = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
 _AGAIN = "export the checkpoint again"
@@ -114,11 +115,8 @@ class Model:
         parts = math.ceil(count / points)
         edges = [count * i // parts for i in range(parts + 1)]
         out = np.empty_like(scene.rows)
-        for number in range(parts):
-            start, stop = edges[number], edges[number + 1]
+        for start, stop in counted(list(pairwise(edges)), progress):
             out[start:stop] = self._run("geometry", views | scene.part(start, stop))[0]
-            if progress:
-                progress(number + 1, parts)
         return out
 
     def _run(self, graph: str, feed: dict[str, np.ndarray]) -> list[np.ndarray]:

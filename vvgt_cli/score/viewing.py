@@ -12,7 +12,7 @@ from vvgt_cli.cameras import FIELD_OF_VIEW, Camera, camera_in_box, default_views
 from vvgt_cli.cameras.blocks import ENOUGH, Blocks, picked, spread_blocks
 from vvgt_cli.gaussians.rules import INRIA, RULES, Rule
 from vvgt_cli.gaussians.targets import target_of
-from vvgt_cli.progress import ProgressCallback
+from vvgt_cli.progress import ProgressCallback, counted
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import RenderSettings, Scene, Viewed
@@ -148,11 +148,9 @@ def condition_views(
     """Render the references of `condition_pictures` and `eye_pictures`, one at a time."""
     from vvgt_cli.dvr import render_view
 
-    for done, (place, camera, blocks) in enumerate(pictures, 1):
+    for place, camera, blocks in counted(pictures, progress):
         image = render_view(scene, camera, settings, blocks)[..., :3]
         yield (place, camera, blocks), picked(image, blocks)
-        if progress:
-            progress(done, len(pictures))
 
 
 def score_texture(
@@ -169,14 +167,8 @@ def score_texture(
     from vvgt_cli.images.metrics import texture
     from vvgt_cli.splat import render
 
-    def pairs() -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        places = near_cameras(size) if cameras is None else cameras
-        for done, camera in enumerate(places):
-            yield render_view(scene, camera, settings), render(gaussians, camera, rule)
-            if progress:
-                progress(done + 1, len(places))
-
-    return texture(pairs())
+    places = counted(near_cameras(size) if cameras is None else cameras, progress)
+    return texture((render_view(scene, camera, settings), render(gaussians, camera, rule)) for camera in places)
 
 
 def near_cameras(size: int) -> list[Camera]:

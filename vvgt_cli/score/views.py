@@ -10,7 +10,7 @@ import numpy as np
 
 from vvgt_cli.cameras import FEW, Blocks, Camera, default_views, picked, render_in_box, spread_blocks
 from vvgt_cli.gaussians import INRIA, Gaussians, Rule
-from vvgt_cli.progress import ProgressCallback
+from vvgt_cli.progress import ProgressCallback, counted
 from vvgt_cli.score.viewing import PREVIEW_VIEWS
 
 if TYPE_CHECKING:
@@ -58,13 +58,11 @@ def score_test_views(
     from vvgt_cli.images.metrics import mean_scores
     from vvgt_cli.splat import render
 
-    views, wanted = [], scored_views(size, every)
-    for done, (i, camera, drawn) in enumerate(wanted):
+    views = []
+    for i, camera, drawn in counted(scored_views(size, every), progress):
         reference, ours = render_view(scene, camera, settings, drawn), render(gaussians, camera, rule, blocks=drawn)
         blocks = spread_blocks(camera.width, camera.height, i)
         views.append(score_drawn_view(reference, ours, blocks, every and drawn is None))
-        if progress:
-            progress(done + 1, len(wanted))
     return mean_scores(views)
 
 
