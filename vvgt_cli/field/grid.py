@@ -38,10 +38,12 @@ class Boxes:
 
     def at(self, number: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the first voxel (3,) of a box and the end of its range, exclusive, int64."""
-        nx, ny, _ = self.shape
-        index = np.array([number % nx, number // nx % ny, number // (nx * ny)], np.int64)
-        lo = index * np.array(self.edge, np.int64)
+        lo = self.index(np.int64(number)) * np.array(self.edge, np.int64)
         return lo, np.minimum(lo + self.edge, self.dims)
+
+    def index(self, numbers: np.ndarray | np.int64) -> np.ndarray:
+        """Return the indices (..., 3) int64, x first, of boxes by number."""
+        return np.stack(np.unravel_index(numbers, self.shape[::-1])[::-1], axis=-1)
 
 
 @dataclass(frozen=True)

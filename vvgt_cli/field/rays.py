@@ -122,12 +122,11 @@ def save_rays(
     store.save(kind, number, table=np.array(table, np.int64).reshape(-1, 3))
 
 
-def _within(boxes: Boxes, lo: np.ndarray, hi: np.ndarray) -> Iterator[int]:
-    """Yield the numbers of the boxes from voxel ``lo`` to ``hi`` (3,), which lie on faces of boxes."""
-    nx, ny, _ = boxes.shape
-    a, b = lo // boxes.edge, -(-hi // np.array(boxes.edge))
-    for k, j, i in itertools.product(*(range(int(p), int(q)) for p, q in zip(a[::-1], b[::-1], strict=True))):
-        yield (k * ny + j) * nx + i
+def _within(boxes: Boxes, lo: np.ndarray, hi: np.ndarray) -> list[int]:
+    """Return the numbers of the boxes from voxel ``lo`` to ``hi`` (3,), which lie on faces of boxes."""
+    (i, j, k), (x, y, z) = lo // boxes.edge, -(-hi // np.array(boxes.edge))
+    numbers: list[int] = np.arange(len(boxes)).reshape(boxes.shape[::-1])[k:z, j:y, i:x].ravel().tolist()
+    return numbers
 
 
 def _piece_rays(
@@ -261,8 +260,6 @@ def front_to_back(pieces: Boxes, eye: np.ndarray, numbers: Sequence[int]) -> lis
     """
     edge = np.array(pieces.edge)
     own = np.floor((eye + 0.5) / edge)
-    nx, ny, _ = pieces.shape
     which = np.array(sorted(numbers), np.int64)
-    index = np.stack([which % nx, which // nx % ny, which // (nx * ny)], axis=-1).reshape(-1, 3)
-    order = np.argsort(np.abs(index - own).sum(axis=1), kind="stable")
+    order = np.argsort(np.abs(pieces.index(which) - own).sum(axis=1), kind="stable")
     return [int(number) for number in which[order]]

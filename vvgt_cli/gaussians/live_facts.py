@@ -23,7 +23,7 @@ VALUES, LABEL_ROW, LAYER_ID = slice(0, 6), 9, 10  # columns of `Gaussians.live`
 AXIS, GRADIENT = slice(3, 6), slice(6, 9)  # the same; the gradient is stored as the normal in a file
 SAMPLED = 64  # nodes of a function that cannot be stored exactly
 MAX_LABELS = 500  # that fit in a header
-MAX_FUNCTION = 12_000  # characters: some loaders read only the first 10 KB of a header, ours 64
+MAX_FUNCTION = 12_000  # characters: some loaders read only the first 10 KB of a header
 WORD = "live"
 
 
