@@ -129,9 +129,9 @@ def test_netcdf_scaling_and_missing_values(tmp_path: Path) -> None:
     assert (volume.data.dtype, volume.slope, volume.intercept) == (np.int16, 0.5, 5000)
     np.testing.assert_allclose(volume.data * volume.slope + volume.intercept, VALUES, atol=0.26)
     volume = read_volume(str(path), ReadOptions(array="holed"))
-    assert (volume.data.dtype, volume.slope, volume.intercept) == (np.float32, 1, 0)
+    assert (volume.data.dtype, volume.slope, volume.intercept) == (np.float32, 0.5, 5000)
     assert np.argwhere(np.isnan(volume.data)).tolist() == [[0, 0, 0], [2, 3, 4]]
-    np.testing.assert_allclose(volume.data[1], VALUES[1], atol=0.26)
+    np.testing.assert_allclose(volume.data[1] * volume.slope + volume.intercept, VALUES[1], atol=0.26)
     volume = read_volume(str(path), ReadOptions(array="unwritten"))
     assert np.isnan(volume.data[0]).all()
     np.testing.assert_allclose(volume.data[1:], VALUES[1:], rtol=1e-6)

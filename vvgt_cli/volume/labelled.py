@@ -6,10 +6,12 @@ Attributes and axes are read as the CF conventions (https://cfconventions.org) h
 from __future__ import annotations
 
 import math
+import operator
 import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -17,9 +19,10 @@ import numpy as np
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError
 from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory
 from vvgt_cli.volume.components import choose_component, contiguous, magnitude
-from vvgt_cli.volume.reading import ReadOptions, Segment, Volume, float_dtype, printable, segments_in, text_of, triple
+from vvgt_cli.volume.reading import ReadOptions, Segment, Volume, printable, segments_in, text_of
 from vvgt_cli.volume.space import metres, unit_name
 from vvgt_cli.volume.stored import Stored
+from vvgt_cli.volume.types import float_dtype, triple, without
 
 EVEN = 0.01  # of a step that a coordinate may be off and still count as evenly spaced (float32 longitudes are)
 AXIS_ATTRIBUTES = ("axis", "standard_name", "units", "positive", "_CoordinateZisPositive")
@@ -247,7 +250,7 @@ def _zyx(space: Sequence[int], axes: Sequence[Axis]) -> list[int]:
 
 
 def decode(values: np.ndarray, attributes: Mapping[str, Any], source: str) -> tuple[np.ndarray, float, float]:
-    """Apply CF attributes: missing values become NaN; slope and intercept are returned, unless NaN made floats needed.
+    """Read CF attributes: values become floats where some of them are missing, which become NaN.
 
     Returns:
         values, slope, intercept: the data value is ``slope * values + intercept``.
@@ -255,16 +258,9 @@ def decode(values: np.ndarray, attributes: Mapping[str, Any], source: str) -> tu
     slope, intercept = _scaling(attributes, source)
     values = values.view(stored_type(values.dtype, attributes))
     missing = _missing(values, attributes, slope, intercept)
-    if missing is None or not missing.any():
-        return values, slope, intercept
-    check_memory(values.size * max(values.itemsize, 4), source)
-    if values.dtype.kind != "f":
-        values = (values * slope + intercept).astype(float_dtype(values.dtype))
-        slope, intercept = 1.0, 0.0
-    elif not values.flags.writeable:
-        values = np.array(values)
-    values[missing] = np.nan
-    return values, slope, intercept
+    if missing.any():
+        check_memory(values.size * float_dtype(values.dtype).itemsize, source)
+    return without(values, missing), slope, intercept
 
 
 def stored_type(dtype: np.dtype, attributes: Mapping[str, Any]) -> np.dtype:
@@ -289,9 +285,8 @@ def _number(attributes: Mapping[str, Any], key: str, default: float, source: str
     return value
 
 
-def _missing(values: np.ndarray, attributes: Mapping[str, Any], slope: float, intercept: float) -> np.ndarray | None:
-    """Return a mask of the stored values (of `stored_type`) that the attributes call missing, or None."""
-    mask: np.ndarray | None = None
+def _missing(values: np.ndarray, attributes: Mapping[str, Any], slope: float, intercept: float) -> np.ndarray:
+    """Return a mask of the stored values (of `stored_type`) that the attributes call missing, False if none can be."""
     marks = [m for key in ("_FillValue", "missing_value") for m in _marks(attributes, key, values.dtype)]
     tests: list[np.ndarray] = [values == mark for mark in marks if mark == mark]
     limits = _marks(attributes, "valid_range", values.dtype)
@@ -301,9 +296,7 @@ def _missing(values: np.ndarray, attributes: Mapping[str, Any], slope: float, in
         lo, hi = ([_packed(m, slope, intercept) for m in some] for some in ((lo, hi) if slope > 0 else (hi, lo)))
     tests += [values < lo[0]] if lo else []
     tests += [values > hi[0]] if hi else []
-    for test in tests:
-        mask = test if mask is None else mask | test
-    return mask
+    return reduce(operator.or_, tests, np.array(False))
 
 
 def _marks(attributes: Mapping[str, Any], key: str, dtype: np.dtype) -> list[Any]:
@@ -433,11 +426,8 @@ def _left(
     if any(index[k] == slice(None) for k in range(len(axes)) if k not in zyx) or options.dims is not None:
         raise UsageError(f"{source}: block by block a magnitude or another grid cannot be read; choose one component")
     flips = [_descends(axes[k], source) for k in zyx]
-    marked = any(key in attributes for key in MARKS)
     kind = stored_type(dtype, attributes)
-    wide = marked and kind.kind != "f"
-    final = float_dtype(kind) if wide else kind
-    scale = _scaling(attributes, source)
+    kind = float_dtype(kind) if any(key in attributes for key in MARKS) else kind
     inner = [sorted(zyx).index(k) for k in zyx]
 
     def read(slices: tuple[slice, ...]) -> np.ndarray:
@@ -445,14 +435,12 @@ def _left(
         for k, part, flip in zip(zyx, slices, flips, strict=True):
             n = axes[k].size
             wanted[k] = slice(n - part.stop, n - part.start) if flip else slice(part.start, part.stop)
-        values, slope, intercept = decode(np.asarray(stored(tuple(wanted))), attributes, source)
-        if wide and values.dtype != final:
-            values = (values * slope + intercept).astype(final)
+        values = decode(np.asarray(stored(tuple(wanted))), attributes, source)[0].astype(kind, copy=False)
         turned: np.ndarray = np.transpose(values, inner)
         return turned[tuple(slice(None, None, -1 if flip else 1) for flip in flips)]
 
-    field: Any = Stored(read, final, tuple(axes[k].size for k in zyx), [chunks[k] for k in zyx], source)
-    volume = _placed(field, [axes[k] for k in zyx], (1.0, 0.0) if wide else scale, options, source, name)
+    field: Any = Stored(read, kind, tuple(axes[k].size for k in zyx), [chunks[k] for k in zyx], source)
+    volume = _placed(field, [axes[k] for k in zyx], _scaling(attributes, source), options, source, name)
     return _named(volume, attributes, dtype, _time(axes, options), source)
 
 

@@ -27,6 +27,15 @@ def float_dtype(dtype: np.dtype) -> np.dtype:
     return np.dtype(np.float32 if dtype.itemsize <= (4 if dtype.kind == "f" else 2) else np.float64)
 
 
+def without(values: np.ndarray, hidden: np.ndarray) -> np.ndarray:
+    """Return values as floats that are NaN where ``hidden``; return them as they are where nothing is."""
+    if not hidden.any():
+        return values
+    out = values.astype(float_dtype(values.dtype))
+    out[hidden] = np.nan
+    return out
+
+
 def triple(values: Iterable[T]) -> tuple[T, T, T]:
     """Return three values as a tuple of known length."""
     x, y, z = values

@@ -11,7 +11,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.components import ArrayInfo, select_from_array
-from vvgt_cli.volume.reading import ReadOptions, Volume, float_dtype
+from vvgt_cli.volume.reading import ReadOptions, Volume, without
 from vvgt_cli.volume.vtk.resample import Grid
 from vvgt_cli.volume.vtk.xml import GHOSTS, HIDDEN
 
@@ -101,13 +101,6 @@ def visible(image: Any, field: np.ndarray, where: str) -> np.ndarray:
             hidden = hidden.reshape(image_place(image, kind).dims[::-1])
             field = without(field, hidden if kind == where else around(hidden, field.shape))
     return field
-
-
-def without(values: np.ndarray, hidden: np.ndarray) -> np.ndarray:
-    """Set ``values`` to NaN where ``hidden``; return them as they are where nothing is."""
-    if not hidden.any():
-        return values
-    return np.where(hidden, np.nan, values).astype(float_dtype(values.dtype))
 
 
 def around(cells: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
