@@ -21,7 +21,8 @@ from vvgt_cli.volume.dicom.pet import in_suv
 from vvgt_cli.volume.dicom.segmentation import is_segmentation, names_of, read_segmentation
 from vvgt_cli.volume.dicom.series import Source, choose_series, headers_in, is_of, one_stack, read_file
 from vvgt_cli.volume.dicom.volumes import ATTRIBUTES, one_volume
-from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, need, printable, select_component
+from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, need, printable, select_component, without
+from vvgt_cli.volume.types import float_dtype
 
 HOUNSFIELD = "HU"  # Rescale Type (0028,1054), and what CT's is where it is absent (PS3.3, C.8.2.1.1.5)
 ANGLE = 1e-3  # of a unit normal: how far slices may be tilted against each other
@@ -388,7 +389,10 @@ def _direction(first: _Slice, third: np.ndarray) -> tuple[float, ...]:
 
 
 def _pixels(slices: list[_Slice], path: Path) -> tuple[np.ndarray, tuple[float, float]]:
-    """Read (slices, rows, columns, samples) values and their scaling; differing scalings are applied, as float32."""
+    """Read (slices, rows, columns, samples) values and their scaling; differing scalings are applied, as float32.
+
+    Values become floats where some of them are padding.
+    """
     first, header = slices[0], slices[0].header
     shape = (int(header.Rows) // first.tiles, int(header.Columns) // first.tiles, int(header.get("SamplesPerPixel", 1)))
     if header.get("PhotometricInterpretation") == "PALETTE COLOR":
@@ -407,7 +411,10 @@ def _pixels(slices: list[_Slice], path: Path) -> tuple[np.ndarray, tuple[float, 
         if out is None:
             check_memory(len(slices) * plane.nbytes, str(path))
             out = np.empty((len(slices), *shape), plane.dtype.newbyteorder("="))
-        if plane.dtype.newbyteorder("=") != out.dtype:
+        if plane.dtype == float_dtype(out.dtype) != out.dtype:
+            check_memory(out.size * plane.itemsize, str(path))
+            out = out.astype(plane.dtype)
+        if out.dtype not in (plane.dtype.newbyteorder("="), float_dtype(plane.dtype)):
             raise DataError(f"{s.source}: pixels of type {plane.dtype}; expected {out.dtype} as in the first slice")
         out[z] = plane
     if out is None:
@@ -416,7 +423,10 @@ def _pixels(slices: list[_Slice], path: Path) -> tuple[np.ndarray, tuple[float, 
 
 
 def _decoded(one: _Slice) -> np.ndarray:
-    """Decode the pixels of a file, through its modality look-up table, the tiles of a mosaic one after the other."""
+    """Decode the pixels of a file, through its modality look-up table, the tiles of a mosaic one after the other.
+
+    Those that are padding are NaN.
+    """
     from pydicom.pixels.processing import apply_modality_lut
 
     dataset = read_file(one.source)
@@ -436,10 +446,23 @@ def _decoded(one: _Slice) -> np.ndarray:
             f"{one.source}: pixels coded as {syntax.name} cannot be decoded ({' '.join(str(error).split())[:200]}); "
             + (f"try: pip install {package}" if package else "convert them to an uncompressed syntax first")
         ) from error
+    padding = _padding(values, dataset)
     if "ModalityLUTSequence" in dataset:
         values = apply_modality_lut(values, dataset)
+    values = without(values, padding)
     if one.tiles > 1:
         rows, columns = (n // one.tiles for n in values.shape[:2])
         values = values[: rows * one.tiles, : columns * one.tiles]
         values = values.reshape(one.tiles, rows, one.tiles, columns).swapaxes(1, 2)
     return values
+
+
+def _padding(stored: np.ndarray, header: Any) -> np.ndarray:
+    """Return a mask of the stored values that are padding (PS3.3, C.7.5.1.1.2), False where none is stated."""
+    kind = {"f4": "Float", "f8": "DoubleFloat"}.get(stored.dtype.str[1:], "")
+    value, limit = (header.get(f"{kind}PixelPadding{word}") for word in ("Value", "RangeLimit"))
+    if not isinstance(value, int | float) or not str(header.get("PhotometricInterpretation")).startswith("MONOCHROME"):
+        return np.array(False)
+    ends = np.array([value, value if limit is None else limit])
+    ends = ends if kind else ends.astype(f"{stored.dtype.kind}2")  # wraps: it may be written with the other sign
+    return np.asarray((stored >= ends.min()) & (stored <= ends.max()))
