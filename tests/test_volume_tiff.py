@@ -348,14 +348,41 @@ def test_info_and_a_series_of_one_file(vvgt, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("spacing", [None, (1, 2, 3)])
-@pytest.mark.parametrize("missing", ["-9999", "nan"])
-def test_sizes_and_missing_values_in_other_tags_are_said(tmp_path: Path, missing: str, spacing: tuple | None) -> None:
+@pytest.mark.parametrize(("missing", "color"), [("none", False), ("0", True), ("-9999", False), ("nan", True)])
+def test_what_is_not_read_of_other_tags_is_said(
+    tmp_path: Path, missing: str, color: bool, spacing: tuple | None
+) -> None:
     tags = [(42113, "s", 0, missing, True), (33550, "d", 3, (30.0, 30.0, 0.0), True)]
-    tifffile.imwrite(tmp_path / "v.tif", np.ones((3, 4, 5), "f4"), photometric="minisblack", extratags=tags)
+    how = {"photometric": "rgb" if color else "minisblack", "extratags": tags}
+    tifffile.imwrite(tmp_path / "v.tif", np.ones((4, 5, 3) if color else (3, 4, 5), "u1"), **how)
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
-        read_volume(str(tmp_path / "v.tif"), ReadOptions(spacing=spacing))
+        read_volume(str(tmp_path / "v.tif"), ReadOptions(spacing=spacing, component=0 if color else None))
     text = " ".join(str(one.message) for one in told)
     assert ("sizes in ModelPixelScale are not read; --spacing X Y Z sets them" in text) == (spacing is None)
-    assert ("voxels of -9999 (GDAL_NODATA) are read as values, not as missing" in text) == (missing == "-9999")
-    assert len(told) == (spacing is None) + (missing == "-9999")
+    unread = missing in ("none", "0")
+    assert (f"voxels of {missing} (GDAL_NODATA) are read as values, not as missing" in text) == unread
+    assert len(told) == (spacing is None) + unread
+
+
+@pytest.mark.parametrize("compression", [None, "zlib"])
+@pytest.mark.parametrize(("kind", "missing"), [("u2", "7"), ("i2", "-9999"), ("f4", "-3.4028234663852886e+38")])
+def test_missing_values_of_gdal_are_unknown(tmp_path: Path, kind: str, missing: str, compression: str | None) -> None:
+    values = VALUES[0].astype(kind) + np.array(20, kind)  # channels, slices, rows, columns
+    how = {"photometric": "minisblack", "compression": compression, "extratags": [(42113, "s", 0, missing, True)]}
+    for name in ("whole", "holed"):
+        tifffile.imwrite(tmp_path / f"{name}.tif", values[1], **how)
+        values[1, 1, 2, 3] = float(missing)
+    tifffile.imwrite(tmp_path / "both.tif", values, ome=True, metadata={"axes": "CZYX"}, **how)
+    expected = values.astype("f8")
+    expected[1, 1, 2, 3] = np.nan
+    assert read_volume(str(tmp_path / "whole.tif")).data.dtype == kind
+    for stored in (False, True):
+        data = read_volume(str(tmp_path / "holed.tif"), ReadOptions(stored=stored)).data
+        np.testing.assert_array_equal(data[:], expected[1])
+        assert data.dtype == np.float32 == data[:1].dtype
+    norm = read_volume(str(tmp_path / "both.tif"), ReadOptions(component="magnitude"))
+    np.testing.assert_allclose(norm.data, np.linalg.norm(expected, axis=0), rtol=1e-6)
+    for k, plane in enumerate(values[1]):
+        tifffile.imwrite(tmp_path / f"z{k}.tif", plane, **how)
+    np.testing.assert_array_equal(read_volume(str(tmp_path / "z*.tif")).data, expected[1])

@@ -33,6 +33,7 @@ from vvgt_cli.volume.space import MICROMETRE, metres
 from vvgt_cli.volume.tiff.decode import Pages
 from vvgt_cli.volume.tiff.ome import ome_tag, open_tiff
 from vvgt_cli.volume.tiff.pages import check_pages
+from vvgt_cli.volume.types import float_dtype, without
 
 _SIZES = {  # tags of programs that state voxel sizes in forms that are not read
     33550: "ModelPixelScale", 34264: "ModelTransformation", 34412: "CZ_LSMINFO", 34118: "CZ_SEM", 34680: "FEI_SFEG",
@@ -107,15 +108,19 @@ def read_tiff(path: Path, options: ReadOptions, slices: int = 1) -> Volume:
             mapped = load_block(path, series.dtype.newbyteorder(file.byteorder), layout.shape, offset=series.dataoffset)
         stored = options.stored and options.component != "magnitude" and (mapped is not None or layout.paged)
         again = partial(_opened, path, number) if stored else lambda: (series, pages)
-        sizes = triple(map(layout.count, "ZYX"))
+        sizes, kind = triple(map(layout.count, "ZYX")), np.dtype(series.dtype)
+        read: Any = partial(_read, layout, kind, cache(again), Lock(), mapped)
+        nodata = printable(str(series.keyframe.tags.valueof(_NODATA, default="nan")).strip("\0 "))[:40]
+        if marked := not layout.color and re.fullmatch(r"-?\d+(\.\d+)?(e[-+]?\d+)?", nodata) is not None:
+            kind = float_dtype(kind)
+            read, nodata = partial(_known, read, float(nodata), kind if stored or slices != 1 else None), "nan"
         picture = Micrograph(
-            layout.count("T"), layout.count("CS"), sizes, np.dtype(series.dtype),
-            partial(_read, layout, np.dtype(series.dtype), cache(again), Lock(), mapped), (1, *sizes[1:]),
+            layout.count("T"), layout.count("CS"), sizes, kind, read, (1, *sizes[1:]),
             facts.spacing, names=facts.channels, colors=facts.colors, rgb=layout.color, samples=bool(layout.of("S")),
-            mapped=mapped is not None, tells=False,
+            mapped=mapped is not None and not marked, tells=False,
         )  # fmt: skip
         if slices:
-            _warn_of_unread(series.keyframe.tags, facts, options, path)
+            _warn_of_unread(series.keyframe.tags, nodata, facts, options, path)
         if mapped is None:
             _whole(series, path)
         volume = picture_volume(picture, replace(options, stored=stored), str(path), volume_name(path))
@@ -128,16 +133,15 @@ def read_tiff(path: Path, options: ReadOptions, slices: int = 1) -> Volume:
     )
 
 
-def _warn_of_unread(tags: Any, facts: Facts, options: ReadOptions, path: Path) -> None:
+def _warn_of_unread(tags: Any, nodata: str, facts: Facts, options: ReadOptions, path: Path) -> None:
     """Warn of a calibration, tags that state sizes, where no others do, or missing values, which are not read."""
     if facts.function is not None:
         warnings.warn(f"{path}: values are not calibrated as ImageJ's function {facts.function!r} says", stacklevel=3)
     names = [name for code, name in _SIZES.items() if code in tags]
     if names and facts.spacing == (None, None, None) and options.spacing is None:
         warnings.warn(f"{path}: sizes in {', '.join(names)} are not read; --spacing X Y Z sets them", stacklevel=3)
-    value = printable(str(tags.valueof(_NODATA, default="")).strip("\0 "))[:20]
-    if value.lower() not in ("", "nan"):
-        warnings.warn(f"{path}: voxels of {value} (GDAL_NODATA) are read as values, not as missing", stacklevel=3)
+    if nodata.lower() not in ("", "nan"):
+        warnings.warn(f"{path}: voxels of {nodata} (GDAL_NODATA) are read as values, not as missing", stacklevel=3)
 
 
 def _opened(path: Path, number: int) -> tuple[Any, Pages, Any]:
@@ -166,6 +170,16 @@ def _read(
             number = int(np.ravel_multi_index(place, lead)) if place else 0
             row[...] = pages.decoded(series[number], series).reshape(inner)[within]
     return layout.zyx(out)
+
+
+def _known(
+    read: Callable[..., np.ndarray], nodata: float, kind: np.dtype | None, time: int, channel: int, box: Slices
+) -> np.ndarray:
+    """Read a box, NaN where it is ``nodata``; of a type ``kind``, or of floats only where there are some."""
+    values = read(time, channel, box)
+    with np.errstate(over="ignore"):  # of a number beyond the type's
+        hidden = np.asarray(values == nodata)
+    return np.ascontiguousarray(without(values, hidden), kind)
 
 
 @contextmanager
