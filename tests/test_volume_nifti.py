@@ -54,6 +54,16 @@ def test_stored_value_scaling(tmp_path: Path, version: int, suffix: str, slope: 
     np.testing.assert_allclose(data_values(volume), nib.load(source).get_fdata(), rtol=1e-12)
 
 
+def test_colours_are_not_scaled(tmp_path: Path) -> None:
+    """As nifti1.h has it."""
+    colors = np.zeros(VALUES.shape, [("R", "u1"), ("G", "u1"), ("B", "u1")])
+    colors["G"] = VALUES
+    nib.Nifti1Image(colors, np.eye(4)).to_filename(source := tmp_path / "v.nii")
+    patch(str(source), 112, np.array([2.5, -7.0], "<f4"))
+    for component in (1, "magnitude"):
+        np.testing.assert_array_equal(data_values(read_volume(str(source), ReadOptions(component=component))), VALUES)
+
+
 @pytest.mark.parametrize("version", [1, 2])
 @pytest.mark.parametrize("shape", [(5,), (5, 4), (5, 4, 3, 1, 1, 1, 1)])
 def test_one_to_seven_axes(tmp_path: Path, shape: tuple[int, ...], version: int) -> None:
