@@ -1,6 +1,7 @@
 """VTK's image formats, written by VTK (or by hand where VTK cannot write them), SLC and TIFF."""
 
 import struct
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -254,8 +255,8 @@ def test_vti_of_fewer_voxels_than_it_stores(tmp_path: Path) -> None:
     refused(DataError, "stores 480 bytes, its header declares 320", read_volume, str(path))
 
 
-def slc(planes: list[bytes], dims: str = "5 4 3", bits: int = 8, coding: int = 1) -> bytes:
-    return f"11111\n{dims} {bits}\n0.5 1 2\n1 6 0 {coding}\n2 2 X".encode() + bytes(12) + b"".join(planes)
+def slc(planes: list[bytes], dims: str = "5 4 3", bits: int = 8, coding: int = 1, unit: int = 1) -> bytes:
+    return f"11111\n{dims} {bits}\n0.5 1 2\n{unit} 6 0 {coding}\n2 2 X".encode() + bytes(12) + b"".join(planes)
 
 
 def runs(plane: np.ndarray) -> bytes:
@@ -280,6 +281,13 @@ def test_slc_as_vtk_reads_it(tmp_path: Path, coding: int) -> None:
     np.testing.assert_array_equal(volume.data.ravel(), theirs)
     assert volume.spacing == reader.GetOutput().GetSpacing() == (0.5, 1, 2)
     assert isinstance(volume.data, np.memmap) == (coding == 0)
+
+
+@pytest.mark.parametrize(("code", "unit"), [(0, "m"), (1, "mm"), (2, "um"), (3, ""), (9, "")])
+def test_slc_states_its_unit_of_length(tmp_path: Path, code: int, unit: str) -> None:
+    (tmp_path / "v.slc").write_bytes(slc([VALUES.astype("u1").tobytes()], coding=0, unit=code))
+    with nullcontext() if unit else pytest.warns(UserWarning, match="is not a known unit of length"):
+        assert read_volume(str(tmp_path / "v.slc")).unit == unit
 
 
 @pytest.mark.parametrize(

@@ -13,9 +13,13 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, load_block, select_component, volume_name
+from vvgt_cli.volume.space import one_unit
 
-# magic, sizes, bits, spacing, (unit, data origin, modification), coding, icon size
-_HEADER = re.compile(rb"\s*11111" + rb"\s+(\d+)" * 4 + rb"\s+(\S+)" * 3 + rb"\s+\d+" * 3 + rb"\s+(\d+)" * 3 + rb" X")
+# magic, sizes, bits, spacing, unit, (data origin, modification), coding, icon size
+_HEADER = re.compile(
+    rb"\s*11111" + rb"\s+(\d+)" * 4 + rb"\s+(\S+)" * 3 + rb"\s+(\d+)" + rb"\s+\d+" * 2 + rb"\s+(\d+)" * 3 + rb" X"
+)
+_UNITS = {b"0": "m", b"1": "mm", b"2": "um", b"3": "foot", b"4": "inch"}  # VolVis' C_UnitType
 _PLANE = re.compile(rb"\s*(\d{1,12}) X")
 
 
@@ -29,7 +33,8 @@ def read_slc(path: Path, options: ReadOptions) -> Volume:
     if bits != 8 or min(nx, ny, nz) < 1:
         raise DataError(f"{path}: {nx} x {ny} x {nz} voxels of {bits} bits; expected 8 bits and at least 1 voxel")
     spacing = options.spacing_or(tuple(float(match[k]) for k in (5, 6, 7)))
-    coding, icon = int(match[8]), 3 * int(match[9]) * int(match[10])
+    _, unit = one_unit([_UNITS.get(match[8], f"code {int(match[8])}")], str(path), True)
+    coding, icon = int(match[9]), 3 * int(match[10]) * int(match[11])
     start = match.end() + icon
     if coding == 0:
         data = load_block(path, np.dtype("u1"), (nz, ny, nx), offset=start)
@@ -38,7 +43,7 @@ def read_slc(path: Path, options: ReadOptions) -> Volume:
     else:
         raise DataError(f"{path}: SLC coding {coding}; expected 0 (plain) or 1 (run lengths)")
     field, _ = select_component(data[..., None], options.component, str(path))
-    return Volume(field, spacing, name=volume_name(path))
+    return Volume(field, spacing, name=volume_name(path), unit=unit)
 
 
 def _decode(path: Path, shape: tuple[int, int, int], start: int) -> np.ndarray:
