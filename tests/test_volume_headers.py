@@ -185,6 +185,13 @@ def test_metaimage_with_a_negative_spacing_runs_the_other_way(tmp_path: Path) ->
     np.testing.assert_array_equal(volume.affine[:3, 1], [0, -2, 0])
 
 
+@pytest.mark.parametrize(("stated", "modality"), [("MET_MOD_CT", "CT"), ("MET_MOD_MR", "MR"), ("MET_MOD_OTHER", "")])
+def test_metaimage_states_its_modality_but_no_hounsfield_units(tmp_path: Path, stated: str, modality: str) -> None:
+    body = meta({"Modality": stated, "ElementDataFile": "LOCAL"}) + VALUES.astype("<i2").tobytes()
+    volume = read_volume(write(tmp_path / "v.mha", body))
+    assert (volume.modality, volume.hounsfield) == (modality, False)
+
+
 def test_metaimage_local_compressed_and_text(tmp_path: Path) -> None:
     body = VALUES.astype("<i2").tobytes()
     local = meta({"ElementDataFile": "LOCAL"}) + body
