@@ -9,6 +9,8 @@ import json
 import re
 import warnings
 from collections.abc import Callable, Sequence
+from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -95,6 +97,13 @@ def _small(path: Path) -> str:
     return path.read_text("utf-8-sig", "replace")
 
 
+def _reader(module: str, kind: str, path: Path) -> Any:
+    """Make a reader of one of VTK's modules for a file."""
+    reader = getattr(import_module(f"vtkmodules.{module}"), kind)()
+    reader.SetFileName(str(path))
+    return reader
+
+
 def _ensight(path: Path) -> Any:
     from vtkmodules.vtkIOEnSight import vtkGenericEnSightReader
 
@@ -120,10 +129,7 @@ def _ensight(path: Path) -> Any:
 
 
 def _exodus(path: Path) -> Any:
-    from vtkmodules.vtkIOExodus import vtkExodusIIReader
-
-    reader = vtkExodusIIReader()
-    reader.SetFileName(str(path))
+    reader = _reader("vtkIOExodus", "vtkExodusIIReader", path)
     reader.GenerateObjectIdCellArrayOff()
     reader.UpdateInformation()
     for kind in (reader.NODAL, reader.ELEM_BLOCK):
@@ -139,8 +145,6 @@ def _times(folder: Path) -> set[float]:
 
 def _openfoam(path: Path) -> Any:
     """Make the reader of a case: of its decomposed parts where they have times that the whole case lacks."""
-    from vtkmodules.vtkIOParallel import vtkPOpenFOAMReader
-
     case, asked = path.parent, path.stem.lower()
     whole = any(p.is_dir() for pattern in ("polyMesh", "*/polyMesh") for p in (case / "constant").glob(pattern))
     mine, parts = _times(case), _times(case / "processor0")
@@ -160,8 +164,7 @@ def _openfoam(path: Path) -> Any:
             f"reconstructed {len(mine)} up to {max(mine, default=0):g}; read {there}.foam, an empty file, for that",
             stacklevel=2,
         )
-    reader = vtkPOpenFOAMReader()
-    reader.SetFileName(str(path))
+    reader = _reader("vtkIOParallel", "vtkPOpenFOAMReader", path)
     reader.SetCaseType(0 if decomposed else 1)
     reader.CreateCellToPointOff()  # values as they are stored
     reader.UpdateInformation()
@@ -173,8 +176,6 @@ def _openfoam(path: Path) -> Any:
 
 
 def _xdmf(path: Path) -> Any:
-    from vtkmodules.vtkIOXdmf2 import vtkXdmfReader
-
     names: list[str] = []
     texts: list[str] = []
     coded = False
@@ -200,16 +201,11 @@ def _xdmf(path: Path) -> Any:
 
     walk_xml(path, start, end, text)
     _check_names(path, names)
-    reader = vtkXdmfReader()
-    reader.SetFileName(str(path))
-    return reader
+    return _reader("vtkIOXdmf2", "vtkXdmfReader", path)
 
 
 def _cgns(path: Path) -> Any:
-    from vtkmodules.vtkIOCGNSReader import vtkCGNSReader
-
-    reader = vtkCGNSReader()
-    reader.SetFileName(str(path))
+    reader = _reader("vtkIOCGNSReader", "vtkCGNSReader", path)
     reader.UpdateInformation()
     reader.EnableAllBases()
     reader.EnableAllPointArrays()
@@ -219,9 +215,8 @@ def _cgns(path: Path) -> Any:
 
 def _plot3d(path: Path) -> Any:
     """Make the reader of ``NAME.xyz`` with ``NAME.q`` or ``.f`` beside it, or of ParaView's ``.p3d`` (JSON)."""
-    from vtkmodules.vtkIOParallel import vtkMultiBlockPLOT3DReader, vtkPlot3DMetaReader
+    from vtkmodules.vtkIOParallel import vtkMultiBlockPLOT3DReader
 
-    reader: Any
     kinds = {"xyz": ".xyz", "q": ".q", "function": ".f"}
     if path.suffix.lower() == ".p3d":
         try:
@@ -231,8 +226,7 @@ def _plot3d(path: Path) -> Any:
             raise DataError(
                 f'{path}: damaged ({error}); expected JSON with "filenames", an "xyz" among them'
             ) from error
-        reader = vtkPlot3DMetaReader()
-        reader.SetFileName(str(path))
+        reader = _reader("vtkIOParallel", "vtkPlot3DMetaReader", path)
     else:
         beside = {kind: any_case(path.with_suffix(suffix)) for kind, suffix in kinds.items()} | {"xyz": path}
         rows = [{kind: file.name for kind, file in beside.items() if file.is_file()}]
@@ -248,16 +242,8 @@ def _plot3d(path: Path) -> Any:
     return reader
 
 
-def _vtkhdf(path: Path) -> Any:
-    from vtkmodules.vtkIOHDF import vtkHDFReader
-
-    reader = vtkHDFReader()
-    reader.SetFileName(str(path))
-    return reader
-
-
 PROGRAMS: dict[str, Callable[[Path], Any]] = {  # what makes VTK's reader of a file, all arrays enabled
-    "VTKHDF": _vtkhdf,
+    "VTKHDF": partial(_reader, "vtkIOHDF", "vtkHDFReader"),
     "EnSight": _ensight,
     "Exodus": _exodus,
     "OpenFOAM": _openfoam,
