@@ -182,13 +182,12 @@ def masked(volume: Volume, mask: Volume, stored: bool = False) -> Volume:
             value = mask.slope * read_block(mask, lo, hi).astype(np.float64) + mask.intercept
             return np.where(np.isfinite(value) & (value != 0), read_block(volume, lo, hi), np.nan).astype(kind)
 
+    lazy: Any = Stored(block, kind, volume.data.shape, chunks_of(volume), volume.name)
     if stored:
-        lazy: Any = Stored(block, kind, volume.data.shape, chunks_of(volume), volume.name)
         return replace(volume, data=lazy)
     out = np.empty(volume.data.shape, kind)
-    nx, ny, nz = volume.dims
-    for z in range(nz):
-        out[z : z + 1] = block((slice(z, z + 1), slice(0, ny), slice(0, nx)))
+    for z in range(len(out)):
+        out[z : z + 1] = lazy[z : z + 1]
     if np.isnan(out).all():
         raise DataError(f"--mask {mask.name}: all of it is 0; expected some voxels that are not, to keep")
     return replace(volume, data=out)
