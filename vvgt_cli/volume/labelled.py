@@ -250,7 +250,7 @@ def _zyx(space: Sequence[int], axes: Sequence[Axis]) -> list[int]:
 
 
 def decode(values: np.ndarray, attributes: Mapping[str, Any], source: str) -> tuple[np.ndarray, float, float]:
-    """Read CF attributes: values become floats where some of them are missing, which become NaN.
+    """Apply CF attributes: missing values become NaN, which makes floats of integers.
 
     Returns:
         values, slope, intercept: the data value is ``slope * values + intercept``.
@@ -270,10 +270,11 @@ def stored_type(dtype: np.dtype, attributes: Mapping[str, Any]) -> np.dtype:
 
 
 def _scaling(attributes: Mapping[str, Any], source: str) -> tuple[float, float]:
-    return _number(attributes, "scale_factor", 1.0, source), _number(attributes, "add_offset", 0.0, source)
+    return number_in(attributes, "scale_factor", 1.0, source), number_in(attributes, "add_offset", 0.0, source)
 
 
-def _number(attributes: Mapping[str, Any], key: str, default: float, source: str) -> float:
+def number_in(attributes: Mapping[str, Any], key: str, default: float, source: str) -> float:
+    """Return the first number of an attribute; raise DataError unless it is finite, and no scale of 0."""
     if key not in attributes:
         return default
     try:
@@ -288,7 +289,8 @@ def _number(attributes: Mapping[str, Any], key: str, default: float, source: str
 def _missing(values: np.ndarray, attributes: Mapping[str, Any], slope: float, intercept: float) -> np.ndarray:
     """Return a mask of the stored values (of `stored_type`) that the attributes call missing, False if none can be."""
     marks = [m for key in ("_FillValue", "missing_value") for m in _marks(attributes, key, values.dtype)]
-    tests: list[np.ndarray] = [values == mark for mark in marks if mark == mark]
+    with np.errstate(over="ignore"):  # of numbers beyond the type's
+        tests: list[np.ndarray] = [values == mark for mark in marks if mark == mark]
     limits = _marks(attributes, "valid_range", values.dtype)
     lo = _marks(attributes, "valid_min", values.dtype) or limits[:1]
     hi = _marks(attributes, "valid_max", values.dtype) or limits[1:2]

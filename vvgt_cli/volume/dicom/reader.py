@@ -389,10 +389,7 @@ def _direction(first: _Slice, third: np.ndarray) -> tuple[float, ...]:
 
 
 def _pixels(slices: list[_Slice], path: Path) -> tuple[np.ndarray, tuple[float, float]]:
-    """Read (slices, rows, columns, samples) values and their scaling; differing scalings are applied, as float32.
-
-    Values become floats where some of them are padding.
-    """
+    """Read (slices, rows, columns, samples) values and their scaling; differing scalings are applied, as float32."""
     first, header = slices[0], slices[0].header
     shape = (int(header.Rows) // first.tiles, int(header.Columns) // first.tiles, int(header.get("SamplesPerPixel", 1)))
     if header.get("PhotometricInterpretation") == "PALETTE COLOR":
@@ -423,10 +420,7 @@ def _pixels(slices: list[_Slice], path: Path) -> tuple[np.ndarray, tuple[float, 
 
 
 def _decoded(one: _Slice) -> np.ndarray:
-    """Decode the pixels of a file, through its modality look-up table, the tiles of a mosaic one after the other.
-
-    Those that are padding are NaN.
-    """
+    """Decode a file's pixels by its modality look-up table, NaN where they are padding, a mosaic tile by tile."""
     from pydicom.pixels.processing import apply_modality_lut
 
     dataset = read_file(one.source)

@@ -16,7 +16,7 @@ from vvgt_cli.volume.headers import MAX_HEADER, HeaderFields
 from vvgt_cli.volume.reading import ReadOptions, Volume, data_file, load_block, select_component, volume_name
 from vvgt_cli.volume.space import MILLIMETRE, metres, one_unit, placed
 
-_MODALITIES = ("CT", "MR", "NM", "US")  # MetaIO's (metaImageTypes.h), which are DICOM's
+_MODALITIES = {f"MET_MOD_{name}": name for name in ("CT", "MR", "NM", "US")}  # MetaIO's (metaImageTypes.h)
 _SCALING = (("slope", 1), ("offset", 0))
 
 
@@ -109,11 +109,8 @@ def read_metaimage(path: Path, options: ReadOptions) -> Volume:
     field, _ = select_component(block, options.component, str(path))
     if any(fields.get(f"elementtointensityfunction{key}", f"{n}") not in (f"{n}", f"{n}.0") for key, n in _SCALING):
         warnings.warn(f"{path}: ElementToIntensityFunction is not applied to its values, as in ITK", stacklevel=2)
-    modality = fields.get("modality", "").upper().removeprefix("MET_MOD_")
-    return placed(
-        field, options=options, name=volume_name(path), modality=modality if modality in _MODALITIES else "",
-        **_place(fields, len(sizes), options),
-    )  # fmt: skip
+    facts = _place(fields, len(sizes), options) | {"modality": _MODALITIES.get(fields.get("modality", ""), "")}
+    return placed(field, options=options, name=volume_name(path), **facts)
 
 
 def _load(fields: HeaderFields, source: Path, dtype: np.dtype, shape: tuple[int, ...], start: int) -> np.ndarray:

@@ -18,7 +18,7 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.volume.arrays.hdf5 import checked_dataset
 from vvgt_cli.volume.arrays.netcdf import check_header
 from vvgt_cli.volume.components import choose_component
-from vvgt_cli.volume.labelled import decode
+from vvgt_cli.volume.labelled import decode, number_in
 from vvgt_cli.volume.libraries import need, read_part
 from vvgt_cli.volume.readers import HDF5, volume_name
 from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, magnitude, placed, text_of
@@ -57,8 +57,7 @@ def read_minc(path: Path, options: ReadOptions) -> Volume:
     """Read a MINC file as float32. An axis that is neither of space nor named ``time`` is of components."""
     with open(path, "rb") as file:
         packed = file.read(len(HDF5)) == HDF5
-    image = _minc2(path) if packed else _minc1(path)
-    return _volume(image, path, options)
+    return _volume(_minc2(path) if packed else _minc1(path), path, options)
 
 
 def _minc1(path: Path) -> _Image:
@@ -190,16 +189,12 @@ def _valid(image: _Image, path: Path) -> tuple[float, float]:
         return 0.0, 1.0
     stated, info = image.attributes, np.iinfo(image.dtype)
     limits = np.ravel(stated["valid_range"]) if "valid_range" in stated else [
-        _number(stated, key, end) for key, end in (("valid_min", info.min), ("valid_max", info.max))
+        number_in(stated, key, end, str(path)) for key, end in (("valid_min", info.min), ("valid_max", info.max))
     ]  # fmt: skip
     low, high = (float(v) for v in limits)
     if not info.min <= low < high <= info.max:
         raise DataError(f"{path}: its valid range is {low:g} to {high:g}; expected one of {image.dtype}, ascending")
     return low, high
-
-
-def _number(attributes: dict[str, Any], key: str, default: float) -> float:
-    return float(np.ravel(attributes[key])[0]) if key in attributes else default
 
 
 def _place(axes: dict[str, dict[str, Any]], names: tuple[str, ...], path: Path) -> tuple[list[list[float]], np.ndarray]:
@@ -213,8 +208,8 @@ def _place(axes: dict[str, dict[str, Any]], names: tuple[str, ...], path: Path) 
         cosines = np.asarray(stated.get("direction_cosines", unit), np.float64).reshape(3)
         _, unit = one_unit([text_of(stated.get("units", "")).strip("_\0 ")], str(path), True)
         cosines = cosines * (metres(unit) or MILLIMETRE) / MILLIMETRE
-        rows.append((cosines * _number(stated, "step", 1.0)).tolist())
-        origin += cosines * _number(stated, "start", 0.0)
+        rows.append((cosines * number_in(stated, "step", 1.0, str(path))).tolist())
+        origin += cosines * number_in(stated, "start", 0.0, str(path))
     if not np.isfinite(rows).all() or not np.isfinite(origin).all():
         raise DataError(f"{path}: its steps or starts are not finite; check that the file is whole")
     return rows, origin

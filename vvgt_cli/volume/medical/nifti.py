@@ -191,7 +191,7 @@ def _volume(header: Header, path: Path, encoding: str, options: ReadOptions) -> 
         shape = (*reversed((*header.dims, 1, 1)[:3]), header.samples)
         block = load_block(source, header.dtype, shape, encoding=encoding, skip=header.offset)
         field = select_component(block, options.component, str(path), label="its colour", color=True)[0]
-        slope, intercept = 1.0, 0.0  # scaling is to be ignored
+        slope, intercept = 1.0, 0.0  # colours are not scaled (nifti1.h)
     else:
         frames = Frames(source, header.dtype, header.dims, header.offset, encoding, header.slope, header.intercept)
         if header.time_unit:

@@ -15,10 +15,8 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, load_block, select_component, volume_name
 from vvgt_cli.volume.space import one_unit
 
-# magic, sizes, bits, spacing, unit, (data origin, modification), coding, icon size
-_HEADER = re.compile(
-    rb"\s*11111" + rb"\s+(\d+)" * 4 + rb"\s+(\S+)" * 3 + rb"\s+(\d+)" + rb"\s+\d+" * 2 + rb"\s+(\d+)" * 3 + rb" X"
-)
+# magic, sizes, bits, spacing, unit, data origin, modification, coding, icon size
+_HEADER = re.compile(rb"\s*11111" + rb"\s+(\d+)" * 4 + rb"\s+(\S+)" * 3 + rb"\s+(\d+)" * 6 + rb" X")
 _UNITS = {b"0": "m", b"1": "mm", b"2": "um", b"3": "foot", b"4": "inch"}  # VolVis' C_UnitType
 _PLANE = re.compile(rb"\s*(\d{1,12}) X")
 
@@ -34,7 +32,7 @@ def read_slc(path: Path, options: ReadOptions) -> Volume:
         raise DataError(f"{path}: {nx} x {ny} x {nz} voxels of {bits} bits; expected 8 bits and at least 1 voxel")
     spacing = options.spacing_or(tuple(float(match[k]) for k in (5, 6, 7)))
     _, unit = one_unit([_UNITS.get(match[8], f"code {int(match[8])}")], str(path), True)
-    coding, icon = int(match[9]), 3 * int(match[10]) * int(match[11])
+    coding, icon = int(match[11]), 3 * int(match[12]) * int(match[13])
     start = match.end() + icon
     if coding == 0:
         data = load_block(path, np.dtype("u1"), (nz, ny, nx), offset=start)

@@ -27,13 +27,14 @@ from xml.etree import ElementTree
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.volume.labelled import decode
 from vvgt_cli.volume.microscopy.image import Micrograph, choose_image, hex_color, picture_volume
 from vvgt_cli.volume.reading import ReadOptions, Slices, Volume, load_block, printable, size_text, triple, volume_name
 from vvgt_cli.volume.space import MICROMETRE, metres
 from vvgt_cli.volume.tiff.decode import Pages
 from vvgt_cli.volume.tiff.ome import ome_tag, open_tiff
 from vvgt_cli.volume.tiff.pages import check_pages
-from vvgt_cli.volume.types import float_dtype, without
+from vvgt_cli.volume.types import float_dtype
 
 _SIZES = {  # tags of programs that state voxel sizes in forms that are not read
     33550: "ModelPixelScale", 34264: "ModelTransformation", 34412: "CZ_LSMINFO", 34118: "CZ_SEM", 34680: "FEI_SFEG",
@@ -113,7 +114,8 @@ def read_tiff(path: Path, options: ReadOptions, slices: int = 1) -> Volume:
         nodata = printable(str(series.keyframe.tags.valueof(_NODATA, default="nan")).strip("\0 "))[:40]
         if marked := not layout.color and re.fullmatch(r"-?\d+(\.\d+)?(e[-+]?\d+)?", nodata) is not None:
             kind = float_dtype(kind)
-            read, nodata = partial(_known, read, float(nodata), kind if stored or slices != 1 else None), "nan"
+            always = kind if stored or slices != 1 else None
+            read, nodata = partial(_known, read, float(nodata), always, str(path)), "nan"
         picture = Micrograph(
             layout.count("T"), layout.count("CS"), sizes, kind, read, (1, *sizes[1:]),
             facts.spacing, names=facts.channels, colors=facts.colors, rgb=layout.color, samples=bool(layout.of("S")),
@@ -172,14 +174,10 @@ def _read(
     return layout.zyx(out)
 
 
-def _known(
-    read: Callable[..., np.ndarray], nodata: float, kind: np.dtype | None, time: int, channel: int, box: Slices
-) -> np.ndarray:
-    """Read a box, NaN where it is ``nodata``; of a type ``kind``, or of floats only where there are some."""
-    values = read(time, channel, box)
-    with np.errstate(over="ignore"):  # of a number beyond the type's
-        hidden = np.asarray(values == nodata)
-    return np.ascontiguousarray(without(values, hidden), kind)
+def _known(read: Any, nodata: float, kind: np.dtype | None, source: str, *place: Any) -> np.ndarray:
+    """Read a box, NaN where it is ``nodata``: of a type ``kind``; where that is None, of floats only if some are."""
+    values, *_ = decode(read(*place), {"_FillValue": nodata}, source)
+    return np.ascontiguousarray(values, kind)
 
 
 @contextmanager
