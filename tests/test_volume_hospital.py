@@ -384,35 +384,6 @@ def test_modality_look_up_tables_as_in_pydicom(tmp_path: Path) -> None:
     np.testing.assert_array_equal(volume.data[k], apply_modality_lut(one.pixel_array, one))
 
 
-@pytest.mark.parametrize(
-    ("signed", "padding", "hidden"),
-    [
-        (1, {"PixelPaddingValue": -2000}, {-2000}),
-        (1, {"PixelPaddingValue": 63536, "vr": "US"}, {-2000}),  # the same bits
-        (0, {"PixelPaddingValue": -2000, "vr": "SS"}, {63536}),
-        (1, {"PixelPaddingValue": -2000, "PixelPaddingRangeLimit": -1998}, {-2000, -1999, -1998}),
-        (1, {"PixelPaddingValue": -1998, "PixelPaddingRangeLimit": -2000}, {-2000, -1999, -1998}),
-        (1, {"PixelPaddingValue": -9}, set()),
-        (1, {"PixelPaddingValue": -2000, "PhotometricInterpretation": "PALETTE COLOR"}, set()),
-    ],
-)
-def test_padding_is_unknown(tmp_path: Path, signed: int, padding: dict, hidden: set) -> None:
-    """Padding is a stored value, whatever the rescale; the first slice has none."""
-    stored = STACK.copy()
-    stored[1, 0, :3], stored[2, 5, 4] = (-2000, -1999, -1998), -2000
-    vr = padding.pop("vr", "SS" if signed else "US")
-    for k, plane in enumerate(stored):
-        one = image(plane, [0, 0, k], PixelRepresentation=signed, RescaleSlope=2, RescaleIntercept=-1000, **padding)
-        for tag in {"PixelPaddingValue", "PixelPaddingRangeLimit"} & {*padding}:
-            one[tag].VR = vr
-        save(one, tmp_path / f"{k}.dcm")
-    volume = read_volume(str(tmp_path))
-    stored = stored if signed else stored.view("<u2")
-    expected = np.where(np.isin(stored, [*hidden]), np.nan, 2.0 * stored - 1000)
-    np.testing.assert_array_equal(volume.data * np.float64(volume.slope) + volume.intercept, expected)
-    assert volume.data.dtype.kind == ("f" if hidden else "iu"[1 - signed])
-
-
 def test_zip_archives_and_dicomdir(tmp_path: Path) -> None:
     source = series(tmp_path / "in", [{}])
     for name, front in (("a.zip", ""), ("b.zip", "study/series/")):

@@ -21,8 +21,7 @@ from vvgt_cli.volume.dicom.pet import in_suv
 from vvgt_cli.volume.dicom.segmentation import is_segmentation, names_of, read_segmentation
 from vvgt_cli.volume.dicom.series import Source, choose_series, headers_in, is_of, one_stack, read_file
 from vvgt_cli.volume.dicom.volumes import ATTRIBUTES, one_volume
-from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, need, printable, select_component, without
-from vvgt_cli.volume.types import float_dtype
+from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, need, printable, select_component
 
 HOUNSFIELD = "HU"  # Rescale Type (0028,1054), and what CT's is where it is absent (PS3.3, C.8.2.1.1.5)
 ANGLE = 1e-3  # of a unit normal: how far slices may be tilted against each other
@@ -408,10 +407,7 @@ def _pixels(slices: list[_Slice], path: Path) -> tuple[np.ndarray, tuple[float, 
         if out is None:
             check_memory(len(slices) * plane.nbytes, str(path))
             out = np.empty((len(slices), *shape), plane.dtype.newbyteorder("="))
-        if plane.dtype == float_dtype(out.dtype) != out.dtype:
-            check_memory(out.size * plane.itemsize, str(path))
-            out = out.astype(plane.dtype)
-        if out.dtype not in (plane.dtype.newbyteorder("="), float_dtype(plane.dtype)):
+        if plane.dtype.newbyteorder("=") != out.dtype:
             raise DataError(f"{s.source}: pixels of type {plane.dtype}; expected {out.dtype} as in the first slice")
         out[z] = plane
     if out is None:
@@ -420,7 +416,7 @@ def _pixels(slices: list[_Slice], path: Path) -> tuple[np.ndarray, tuple[float, 
 
 
 def _decoded(one: _Slice) -> np.ndarray:
-    """Decode a file's pixels by its modality look-up table, NaN where they are padding, a mosaic tile by tile."""
+    """Decode a file's pixels by its modality look-up table, a mosaic tile by tile."""
     from pydicom.pixels.processing import apply_modality_lut
 
     dataset = read_file(one.source)
@@ -440,23 +436,10 @@ def _decoded(one: _Slice) -> np.ndarray:
             f"{one.source}: pixels coded as {syntax.name} cannot be decoded ({' '.join(str(error).split())[:200]}); "
             + (f"try: pip install {package}" if package else "convert them to an uncompressed syntax first")
         ) from error
-    padding = _padding(values, dataset)
     if "ModalityLUTSequence" in dataset:
         values = apply_modality_lut(values, dataset)
-    values = without(values, padding)
     if one.tiles > 1:
         rows, columns = (n // one.tiles for n in values.shape[:2])
         values = values[: rows * one.tiles, : columns * one.tiles]
         values = values.reshape(one.tiles, rows, one.tiles, columns).swapaxes(1, 2)
     return values
-
-
-def _padding(stored: np.ndarray, header: Any) -> np.ndarray:
-    """Return a mask of the stored values that are padding (PS3.3, C.7.5.1.1.2), False where none is stated."""
-    kind = {"f4": "Float", "f8": "DoubleFloat"}.get(stored.dtype.str[1:], "")
-    value, limit = (header.get(f"{kind}PixelPadding{word}") for word in ("Value", "RangeLimit"))
-    if not isinstance(value, int | float) or not str(header.get("PhotometricInterpretation")).startswith("MONOCHROME"):
-        return np.array(False)
-    ends = np.array([value, value if limit is None else limit])
-    ends = ends if kind else ends.astype(f"{stored.dtype.kind}2")  # wraps: it may be written with the other sign
-    return np.asarray((stored >= ends.min()) & (stored <= ends.max()))
