@@ -10,7 +10,7 @@ const REST = 150, COARSE = 3, MOST = 32, QUIET = 2;  // ms without a change; par
 const FAST = 60, SLOW = 200, THIN = 8;  // ms in which a band of a frame may be done, to be twice, or half as high; its least rows
 const HOLE = -65504;  // of what is unknown, which no value near it makes visible
 const cells = (dims) => dims.map((n) => Math.ceil(n / BLOCK));
-const STEEP = 2, BENT = 0.1;  // optical depth of a voxel by which extinction differs along a segment that is sampled finer; at rest
+const STEEP = 2, BENT = 0.1;  // optical depth of a voxel by which extinction differs along a segment that is sampled finer while something moves; at rest
 const LOST = 'its graphics were lost', BACK = 5000;  // ms until which they may come back
 const FLAT = 0.02;  // steps of values between neighbours up to which rounding may be all there is
 const FAINT = 0.05;  // opacity along a ray below which there is nothing
@@ -326,7 +326,7 @@ export function raycaster(facts, gridsOf, { app }) {
     ray('2f', 'size', ...size);
     ray('3f', 'jitter', n ? halton(n, 2) : 0.5, n ? halton(n, 3) : 0.5, n * 0.61803398875);
     ray('1f', 'ds', look.step * times * (kind === 1 ? 0.5 : 1));
-    ray('1f', 'most', (n ? BENT : STEEP) / look.step);
+    ray('1f', 'most', (times < 1 ? BENT : STEEP) / look.step);
     ray('1f', 'again', n);
     ray('1i', 'kind', kind);
     ray('1i', 'alone', mask ? 1 : 0);
