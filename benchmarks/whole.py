@@ -22,7 +22,10 @@ import click
 from curve import calls, read_rows, timed
 from dvr_scenes import read_scenes, write_rows
 
-STEP = {"bonsai-tree": 1.5, "embryo-shells": 2.0, "headsq-bone-skin": 1.0, "spm152-tissue": 2.0}  # voxels
+STEP = {  # voxels
+    "bonsai-tree": 3.0, "embryo-shells": 3.0, "embryo-opaque": 3.0, "ironprot-density": 1.5, "neghip-fog": 2.0,
+    "headsq-bone-skin": 2.0, "headsq-step": 1.5, "spm152-tissue": 3.0,
+}  # fmt: skip
 VIEWS, SIZE = 24, 400
 
 
