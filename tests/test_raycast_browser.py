@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import nibabel as nib
 import numpy as np
 import pytest
 from browser import first_of_orbit, page_picture
@@ -122,17 +123,22 @@ def test_labels_are_hidden_and_coloured(tmp_path: Path, light: str) -> None:
     assert psnr(one, seen) > max(57, psnr(both, seen) + 10)
 
 
-@pytest.mark.parametrize("light", ["none", "headlight"])
-def test_a_layer_that_goes_on_beyond_the_first_volume(tmp_path: Path, light: str) -> None:
+@pytest.mark.parametrize(("light", "coarser"), [("none", 1), ("headlight", 1), ("none", 4)])
+def test_a_layer_that_goes_on_beyond_the_first_volume(tmp_path: Path, light: str, coarser: int) -> None:
     z, y, x = np.mgrid[:24, :24, :24]
-    np.save(tmp_path / "waves.npy", (np.sin(0.7 * x) * np.cos(0.6 * y) + z / 24).astype(np.float32))
+    waves = (np.sin(0.7 * x) * np.cos(0.6 * y) + z / 24).astype(np.float32)
     (tmp_path / "tf.json").write_text(json.dumps(SHELL))
-    path, page = tmp_path / "waves.npy", tmp_path / "layers.html"
-    source = [str(path), "--crop", "5:19,:,3:", "--tf", "viridis", "--light", light]
-    source += ["--layer", f"{path},tf={tmp_path / 'tf.json'}"]
+    path, page, first = tmp_path / "waves.nii", tmp_path / "layers.html", tmp_path / "first.nii"
+    nib.save(nib.Nifti1Image(waves.T, np.eye(4)), path)
+    part = waves[4:, :, 4:20].T[::coarser, ::coarser, ::coarser]
+    shift = (coarser - 1) / 2
+    place = np.diag([coarser, coarser, coarser, 1.0])
+    place[:3, 3] = 4 + shift, shift, 4 + shift
+    nib.save(nib.Nifti1Image(part, place), first)
+    source = [str(first), "--tf", "viridis", "--light", light, "--layer", f"{path},tf={tmp_path / 'tf.json'}"]
     assert run(["convert", *source, *MADE, "-o", str(page)]) == 0
     found = psnr(rendered(tmp_path, *source), pictured(page, tmp_path, ""))
-    print(f"{light}: {found:.2f} dB")
+    print(f"{light}, {coarser}: {found:.2f} dB")
     assert found > 40
 
 

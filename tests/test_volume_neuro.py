@@ -193,23 +193,6 @@ def test_minc_vectors_are_components(tmp_path: Path, axes: str, version: int) ->
         np.testing.assert_allclose(norm.data[:], np.linalg.norm(expected, axis=0), rtol=1e-6)
 
 
-@pytest.mark.parametrize("kind", ["i2", "f4"])
-def test_values_of_minc_that_are_not_valid_are_unknown(tmp_path: Path, kind: str) -> None:
-    """Those outside of the valid range, as MINC's programs have it, and fill values."""
-    values = np.arange(120, dtype=kind).reshape(4, 5, 6)
-    with h5py.File(tmp_path / "v.mnc", "w") as file:
-        group = file.create_group("minc-2.0/image/0")
-        file.create_group("minc-2.0/dimensions")
-        group["image"] = values
-        group["image"].attrs.update(dimorder="zspace,yspace,xspace", valid_range=[3.0, 103.0], _FillValue=7)
-        group["image-min"], group["image-max"] = 3.0, 103.0
-    expected = np.where((values < 3) | (values > 103) | (values == 7), np.nan, values)
-    for stored in (False, True):
-        np.testing.assert_array_equal(
-            read_volume(str(tmp_path / "v.mnc"), ReadOptions(stored=stored)).data[:], expected
-        )
-
-
 def sequence(kinds: str = "list domain domain domain") -> bytes:
     """A sequence as 3D Slicer writes it: three frames, the values of a voxel one behind the other."""
     text = (

@@ -14,6 +14,7 @@ import tifffile
 from tests.refused import refused
 from vvgt_cli.errors import DataError, UsageError, VvgtError
 from vvgt_cli.volume import ReadOptions, read_volume
+from vvgt_cli.volume.label_maps import recognised
 
 T, C, Z, Y, X = 3, 2, 4, 6, 5
 VALUES = np.random.default_rng(3).integers(0, 200, (T, C, Z, Y, X)).astype("u2")
@@ -348,7 +349,9 @@ def test_info_and_a_series_of_one_file(vvgt, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("spacing", [None, (1, 2, 3)])
-@pytest.mark.parametrize(("missing", "color"), [("none", False), ("0", True), ("-9999", False), ("nan", True)])
+@pytest.mark.parametrize(
+    ("missing", "color"), [("none", False), ("0", True), ("-9999", False), ("-nan", False), ("nan", True)]
+)
 def test_what_is_not_read_of_other_tags_is_said(
     tmp_path: Path, missing: str, color: bool, spacing: tuple | None
 ) -> None:
@@ -363,6 +366,18 @@ def test_what_is_not_read_of_other_tags_is_said(
     unread = missing in ("none", "0")
     assert (f"voxels of {missing} (GDAL_NODATA) are read as values, not as missing" in text) == unread
     assert len(told) == (spacing is None) + unread
+
+
+def test_missing_values_of_some_slices_and_of_label_maps(tmp_path: Path) -> None:
+    tags, label = {"extratags": [(42113, "s", 0, "-3.e0", True)]}, {"extratags": [(42113, "s", 0, "0", True)]}
+    for k, how in enumerate((tags, {})):
+        tifffile.imwrite(tmp_path / f"s{k}.tif", np.full((4, 5), -3, "i2"), photometric="minisblack", **how)
+    volume = read_volume(str(tmp_path / "s*.tif"))
+    assert np.isnan(volume.data[0]).all()
+    assert (volume.data[1] == -3).all()
+    labels = np.arange(60, dtype="u1").reshape(3, 4, 5) // 20
+    tifffile.imwrite(tmp_path / "labels.tif", labels, photometric="minisblack", **label)
+    assert recognised(read_volume(str(tmp_path / "labels.tif")))
 
 
 @pytest.mark.parametrize("compression", [None, "zlib"])

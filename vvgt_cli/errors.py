@@ -34,11 +34,11 @@ class DataError(VvgtError):
 
 @contextmanager
 def naming(what: str) -> Iterator[None]:
-    """Put ``what`` in front of every `DataError` of the block that does not begin with it."""
+    """Put ``what`` and a colon in front of every `DataError` of the block that does not begin with them."""
     try:
         yield
     except DataError as error:
-        raise error if str(error).startswith(what) else DataError(f"{what}: {error}") from None
+        raise error if str(error).startswith((f"{what}:", f"{what}#")) else DataError(f"{what}: {error}") from None
 
 
 class DeviceFailed(DataError):

@@ -71,6 +71,7 @@ def recognised(volume: Volume, labels: Callable[[Volume], list[int]] = labels_in
     most = MASKS if {word.lower() for word in NAMED.findall(volume.name)} == {"mask"} else FEW
     middle = len(volume.data) // 2
     first = volume.slope * np.unique(volume.data[middle : middle + 1]) + volume.intercept  # one slice decides for most
+    first = first[np.isfinite(first)]
     try:
         return len(first) <= most and bool((first == np.round(first)).all()) and len(labels(volume)) <= most
     except DataError:  # fractions elsewhere

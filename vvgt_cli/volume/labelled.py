@@ -274,7 +274,7 @@ def _scaling(attributes: Mapping[str, Any], source: str) -> tuple[float, float]:
 
 
 def number_in(attributes: Mapping[str, Any], key: str, default: float, source: str) -> float:
-    """Return the first number of an attribute; raise DataError unless it is finite, and no scale of 0."""
+    """Return the first number of an attribute; raise DataError if it is not finite, or a ``scale_factor`` of 0."""
     if key not in attributes:
         return default
     try:
@@ -282,7 +282,7 @@ def number_in(attributes: Mapping[str, Any], key: str, default: float, source: s
     except (ValueError, TypeError, IndexError):
         value = math.nan
     if not math.isfinite(value) or (key == "scale_factor" and value == 0):
-        raise DataError(f"{source}: attribute {key} is {attributes[key]!r}; expected a finite number")
+        raise DataError(f"{source}: attribute {key} is {attributes[key]}; expected a finite number, and no scale of 0")
     return value
 
 

@@ -77,7 +77,7 @@ class Volume:
         slope, intercept: stored-value scaling (NIfTI, DICOM), slope finite and not 0.
         space: anatomical space that direction and origin are in, "RAS" or "LPS", None where there is none.
         hounsfield: whether the file says that data values are Hounsfield units.
-        modality: as DICOM abbreviates it, "CT" or "MR"; "" unknown.
+        modality: as DICOM abbreviates it, "CT", "MR", "NM" or "US"; "" unknown.
         reference: UID of DICOM's frame of reference: positions of two volumes compare where it is the same.
         quantity: what the values are, as the file calls them ("temperature"); "" unknown.
         preset: name of the function that shows such values (smoke, fire), or `DENSITY` of a map (MRC, CCP4, cube,

@@ -18,7 +18,7 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.volume.arrays.hdf5 import checked_dataset
 from vvgt_cli.volume.arrays.netcdf import check_header
 from vvgt_cli.volume.components import choose_component
-from vvgt_cli.volume.labelled import decode, number_in
+from vvgt_cli.volume.labelled import number_in
 from vvgt_cli.volume.libraries import need, read_part
 from vvgt_cli.volume.readers import HDF5, volume_name
 from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, magnitude, placed, text_of
@@ -165,11 +165,11 @@ def _scaled(image: _Image, spatial: list[int], fixed: dict[int, int], path: Path
             box = (slice(z.start + k, min(z.start + k + deep, z.stop)), *slices[1:])
             at: dict[int, Any] = fixed | dict(zip(spatial, box, strict=True))
             index = tuple(at[axis] for axis in range(len(image.shape)))
-            values, *_ = decode(image.read(index), image.attributes, str(path))  # NaN where they are not valid
+            values = image.read(index)
             if image.ends is not None and image.dtype.kind != "f":
                 first, last = (_along(end, index) for end in image.ends)
                 slope = (last - first) / (high - low)
-                values = values * slope + (first - low * slope)
+                values = np.clip(values, low, high) * slope + (first - low * slope)
             out[k : k + deep] = values
         return out
 

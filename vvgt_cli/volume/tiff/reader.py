@@ -112,10 +112,13 @@ def read_tiff(path: Path, options: ReadOptions, slices: int = 1) -> Volume:
         sizes, kind = triple(map(layout.count, "ZYX")), np.dtype(series.dtype)
         read: Any = partial(_read, layout, kind, cache(again), Lock(), mapped)
         nodata = printable(str(series.keyframe.tags.valueof(_NODATA, default="nan")).strip("\0 "))[:40]
-        if marked := not layout.color and re.fullmatch(r"-?\d+(\.\d+)?(e[-+]?\d+)?", nodata) is not None:
+        missing = _number(nodata)
+        if missing is not None and math.isnan(missing):
+            nodata, missing = "nan", None
+        if marked := missing is not None and not layout.color:
             kind = float_dtype(kind)
             always = kind if stored or slices != 1 else None
-            read, nodata = partial(_known, read, float(nodata), always, str(path)), "nan"
+            read, nodata = partial(_known, read, missing, always, str(path)), "nan"
         picture = Micrograph(
             layout.count("T"), layout.count("CS"), sizes, kind, read, (1, *sizes[1:]),
             facts.spacing, names=facts.channels, colors=facts.colors, rgb=layout.color, samples=bool(layout.of("S")),
@@ -133,6 +136,13 @@ def read_tiff(path: Path, options: ReadOptions, slices: int = 1) -> Volume:
     return replace(
         volume, unit=facts.length, slope=facts.scaling[0], intercept=facts.scaling[1], value_unit=facts.value_unit
     )
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None
 
 
 def _warn_of_unread(tags: Any, nodata: str, facts: Facts, options: ReadOptions, path: Path) -> None:

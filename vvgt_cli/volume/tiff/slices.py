@@ -22,6 +22,7 @@ from vvgt_cli.volume.stored import Slices, stored_or_loaded
 from vvgt_cli.volume.tiff import KINDS, SUFFIXES, TIFF
 from vvgt_cli.volume.tiff.decode import open_image
 from vvgt_cli.volume.tiff.reader import read_tiff
+from vvgt_cli.volume.types import float_dtype
 
 MAX_FILES = 100_000  # files
 
@@ -101,7 +102,7 @@ def _part(files: list[Path], plane: np.ndarray, load: Callable[[Path], np.ndarra
     out = np.empty([s.stop - s.start for s in slices], plane.dtype)
     for row, file in zip(out, files[z], strict=True):
         values = load(file)
-        if values.shape != plane.shape or values.dtype != plane.dtype:
+        if values.shape != plane.shape or plane.dtype not in (values.dtype, float_dtype(values.dtype)):
             raise DataError(
                 f"{file}: {values.shape[2]} x {values.shape[1]} {values.dtype}; expected {plane.shape[2]} x "
                 f"{plane.shape[1]} {plane.dtype} as in {files[0].name}"

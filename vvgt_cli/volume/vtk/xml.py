@@ -22,7 +22,7 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import count, load_block, unpack
 from vvgt_cli.volume.components import ArrayInfo, choose_array, magnitude, select_from_array, selected_dtype
 from vvgt_cli.volume.readers import HEAD_BYTES, lazy, volume_name
-from vvgt_cli.volume.reading import HeaderFields, ReadOptions, Slices, type_of
+from vvgt_cli.volume.reading import ReadOptions, Slices, type_of
 from vvgt_cli.volume.stored import stored_or_loaded
 from vvgt_cli.volume.types import IDENTITY, Volume
 from vvgt_cli.volume.vtk import IMAGE, xml_kind
@@ -170,9 +170,19 @@ def _note_array(header: Scan, attributes: dict[str, str], position: int, path: P
     header.arrays.append(DataArray(info, attributes, position))
 
 
+def _numbers(text: str, n: int, path: Path, what: str) -> list[float]:
+    try:
+        values = [float(t) for t in text.split()]
+    except ValueError:
+        values = []
+    if len(values) != n:
+        raise DataError(f"{path}: {what} is {text!r}; expected {n} numbers")
+    return values
+
+
 def extent_of(text: str, path: Path, what: str = "WholeExtent") -> np.ndarray:
     """Parse an extent, (3, 2) int64: first and last point along x, y and z; raise DataError for anything else."""
-    ends = np.array(HeaderFields(str(path)).floats(what, text, 6))
+    ends = np.array(_numbers(text, 6, path, what))
     if not (np.abs(ends) < 1 << 31).all():
         raise DataError(f"{path}: {what} is {text!r}; expected 6 integers of 32 bits")
     return ends.astype(np.int64).reshape(3, 2)
@@ -185,10 +195,9 @@ def image_grid(image: dict[str, str], where: str, path: Path) -> Grid:
         raise DataError(
             f"{path}: WholeExtent {extent.ravel().tolist()} is empty; expected at least one voxel along each axis"
         )
-    numbers = HeaderFields(str(path)).floats
-    spacing = numbers("Spacing", image.get("Spacing", "1 1 1"), 3)
-    origin = numbers("Origin", image.get("Origin", "0 0 0"), 3)
-    direction = numbers("Direction", image["Direction"], 9) if "Direction" in image else IDENTITY
+    spacing = _numbers(image.get("Spacing", "1 1 1"), 3, path, "Spacing")
+    origin = _numbers(image.get("Origin", "0 0 0"), 3, path, "Origin")
+    direction = _numbers(image["Direction"], 9, path, "Direction") if "Direction" in image else IDENTITY
     return Grid.of_image(extent, spacing, origin, direction, where)
 
 

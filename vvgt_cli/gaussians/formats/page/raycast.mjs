@@ -41,14 +41,15 @@ const less = (a, b) => (a < b ? a : b), more = (a, b) => (a > b ? a : b);
 // what the shader has for each layer
 function layersText(layers) {
   const joined = (mark, text) => layers.map((layer, k) => text(k, layer)).join(mark), each = (text) => joined('\n', text), single = layers.length === 1 && !layers[0].labels;
-  return `struct Sample { ${joined(' ', (k, { labels }) => `${labels ? 'vec4' : 'float'} s${k};`)} };  // values, and optics of labels
+  return `uniform vec3 rim;  // half a voxel of the grid of all layers, which has the first one's box and the finest voxels
+struct Sample { ${joined(' ', (k, { labels }) => `${labels ? 'vec4' : 'float'} s${k};`)} };  // values, and optics of labels
 ${each((k, { labels, one }) => `uniform ${labels ? 'usampler3D' : 'sampler3D'} v${k};
 uniform sampler3D b${k};
 uniform mat4 m${k};
 uniform vec3 n${k}, f${k};  // dims; value at 0, what it gains, first row of the table
 ${k ? `uniform mat4 g${k}, h${k};  // from the first grid to this one, and back
-vec3 framed${k}(vec3 q) {  // as \`vvgt render\` lays layers on the first grid: between its faces and its outermost voxels' centres nothing changes
-  vec3 first = (h${k} * vec4(q, 1.0)).xyz, e = 0.5 / n0, c = clamp(first, e, 1.0 - e);
+vec3 framed${k}(vec3 q) {  // as \`vvgt render\` lays layers on one grid: between its faces and its outermost voxels' centres nothing changes
+  vec3 first = (h${k} * vec4(q, 1.0)).xyz, c = clamp(first, rim, 1.0 - rim);
   return q + mat3(g${k}) * (c - first);
 }` : 'vec3 framed0(vec3 q) { return q; }'}
 vec2 empty${k}(vec3 p, vec3 d, float best) {  // how far to the end of a block; 1: it shows something
@@ -255,8 +256,10 @@ export function raycaster(facts, gridsOf, { app }) {
     put('1i', 'older', 0);
     const part = (grid, at) => at.map((x, c) => (x + 0.5) / grid.dims[c]), voxel = (grid, at) => at.map((x, c) => x * grid.dims[c] - 0.5);
     const matrix = (to) => { const o = to([0, 0, 0]); return [...AXES.flatMap((e) => [...minus(to(e), o), 0]), ...o, 1]; };
+    const between = (from, to) => matrix((at) => part(to, index(to, place(from, voxel(from, at)))));
+    const finer = (axis, grid) => AXES.map((_, c) => Math.round((Math.abs(between(grids[0], grid)[4 * axis + c]) * grid.dims[c]) / grids[0].dims[axis]));
+    ray('3f', 'rim', ...AXES.map((_, axis) => 0.5 / (grids[0].dims[axis] * Math.max(1, ...grids.flatMap((grid) => finer(axis, grid))))));
     for (const { k, grid, scale } of drawn) {
-      const between = (from, to) => matrix((at) => part(to, index(to, place(from, voxel(from, at)))));
       ray('1i', `v${k}`, 2 + 2 * k);
       ray('1i', `b${k}`, 3 + 2 * k);
       ray('Matrix4fv', `m${k}`, false, matrix((p) => part(grid, index(grid, p))));
