@@ -257,7 +257,7 @@ export function raycaster(facts, gridsOf, { app }) {
     const part = (grid, at) => at.map((x, c) => (x + 0.5) / grid.dims[c]), voxel = (grid, at) => at.map((x, c) => x * grid.dims[c] - 0.5);
     const matrix = (to) => { const o = to([0, 0, 0]); return [...AXES.flatMap((e) => [...minus(to(e), o), 0]), ...o, 1]; };
     const between = (from, to) => matrix((at) => part(to, index(to, place(from, voxel(from, at)))));
-    const finer = (axis, grid) => AXES.map((_, c) => Math.round((Math.abs(between(grids[0], grid)[4 * axis + c]) * grid.dims[c]) / grids[0].dims[axis]));
+    const finer = (axis, grid) => AXES.map((_, c) => Math.round((Math.abs(between(grids[0], grid)[4 * axis + c]) * grid.dims[c]) / grids[0].dims[axis] - 1e-6));  // as dvr/layers.py has it
     ray('3f', 'rim', ...AXES.map((_, axis) => 0.5 / (grids[0].dims[axis] * Math.max(1, ...grids.flatMap((grid) => finer(axis, grid))))));
     for (const { k, grid, scale } of drawn) {
       ray('1i', `v${k}`, 2 + 2 * k);
