@@ -1,12 +1,14 @@
 """Crops, masks, colours, channels and layers: what adds up, where it lies, and what is refused."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import nibabel
 import numpy as np
 import pytest
+import SimpleITK as sitk
 import tifffile
 
 import vvgt_cli as library
@@ -68,6 +70,25 @@ def test_a_mask_hides_and_must_have_the_size() -> None:
     refused(DataError, "all of it is 0", masked, volume, Volume(keep * 0))
     big = replace(volume, data=volume.data.astype(np.int32) * 1000003)
     np.testing.assert_array_equal(masked(big, Volume(keep)).data[1], big.data[1])
+
+
+def test_a_mask_is_where_its_file_says(vvgt, tmp_path: Path) -> None:
+    affine = np.array([[0, -2, 0, 10], [1.5, 0, 0, -4], [0, 0, 1, 7], [0, 0, 0, 1.0]])
+    values = np.random.default_rng(3).integers(1, 99, (5, 6, 7)).astype(np.int16)
+    scan, keep = nibabel.Nifti1Image(values, affine), nibabel.Nifti1Image((values > 60).astype(np.uint8), affine)
+    nibabel.save(scan, tmp_path / "v.nii")
+    nibabel.save(nibabel.as_closest_canonical(keep), tmp_path / "m.nii")  # its axes in another order
+    image = sitk.GetImageFromArray(np.asarray(keep.dataobj).T)
+    image.SetSpacing((1.5, 2, 1)), image.SetOrigin((-10, 4, 7)), image.SetDirection((0, 1, 0, -1, 0, 0, 0, 0, 1))
+    sitk.WriteImage(sitk.DICOMOrient(image, "AIR"), tmp_path / "m.nrrd")
+    for name, how in (("m.nii", {}), ("m.nrrd", {}), ("m.nii", {"crop": "1:4,2:,:6"})):
+        part = library.read_volume(tmp_path / "v.nii", mask=tmp_path / name, **how).data
+        whole = values.T[:6, 2:, 1:4] if how else values.T
+        np.testing.assert_array_equal(np.nan_to_num(part), np.where(whole > 60, whole, 0))
+    keep.affine[2, 3] += 1
+    nibabel.save(nibabel.Nifti1Image(np.asarray(keep.dataobj), keep.affine), tmp_path / "m.nii")
+    said = vvgt("info", tmp_path / "v.nii", "--mask", tmp_path / "m.nii").error
+    assert re.search("--mask m: 5 x 6 x 7 voxels.*; expected the grid of v", said), said
 
 
 def test_of_scalars_and_labels_on_the_command_line(vvgt, tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from vvgt_cli.volume.options import ReadOptions, crop, masked, parse_crop
 from vvgt_cli.volume.plain import RAW
 from vvgt_cli.volume.plain.raw import parse_name, read_stdin
 from vvgt_cli.volume.readers import HEAD_BYTES, READERS, SCHEMES, STEPPED, Reader, is_glob, register_plugins
-from vvgt_cli.volume.space import in_space
+from vvgt_cli.volume.space import in_space, turned
 from vvgt_cli.volume.tiff import SLICES
 from vvgt_cli.volume.types import Volume
 
@@ -68,6 +68,7 @@ def cut(volume: Volume, options: ReadOptions) -> Volume:
     box = None if options.crop is None else parse_crop(options.crop)
     how = ReadOptions(stored=options.stored)
     mask = read_volume(options.mask, how) if isinstance(options.mask, str) else options.mask
+    mask = mask if mask is None else turned(mask, volume)
     if mask is not None and box is not None and mask.dims == volume.dims:
         mask = crop(mask, box)
     volume = volume if box is None else crop(volume, box)

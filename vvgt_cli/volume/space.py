@@ -16,7 +16,8 @@ import numpy as np
 
 from vvgt_cli.errors import UsageError
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.stored import Stored
+from vvgt_cli.volume.types import Volume, triple
 
 SPACES = ("RAS", "LPS")
 _OPPOSITE = {"R": "L", "L": "R", "A": "P", "P": "A", "S": "I", "I": "S"}
@@ -69,6 +70,22 @@ def in_space(volume: Volume, wanted: str | None) -> Volume:
     direction = tuple(signs[k // 3] * v + 0.0 for k, v in enumerate(volume.direction))  # + 0.0: no -0
     origin = tuple(s * o + 0.0 for s, o in zip(signs, volume.origin, strict=True))
     return replace(volume, direction=direction, origin=origin, space=wanted)
+
+
+def turned(volume: Volume, to: Volume) -> Volume:
+    """Return a volume with its index axes in the order and directions of another's, if it has these axes in memory."""
+    volume = in_space(volume, to.space) if volume.space and to.space else volume
+    signs = np.rint(np.linalg.inv(volume.affine) @ to.affine)[:3, :3]
+    across = np.abs(signs)
+    apart = (across.sum(0) != 1).any() or (across.sum(1) != 1).any() or not volume.compares(to)
+    if apart or isinstance(volume.data, Stored):
+        return volume
+    flips = tuple(slice(None, None, -1 if sign < 0 else 1) for sign in signs.sum(0)[::-1])
+    data = volume.data.transpose([2 - k for k in across.argmax(0)[::-1]])[flips]
+    steps, lengths = volume.affine[:3, :3] @ signs, np.array(volume.spacing) @ across
+    first = volume.affine @ [*np.where(signs.sum(1) < 0, np.array(volume.dims) - 1, 0), 1]
+    direction = tuple((steps / lengths).ravel().tolist())
+    return replace(volume, data=data, spacing=triple(lengths), origin=tuple(first[:3].tolist()), direction=direction)
 
 
 def metres(unit: str) -> float | None:

@@ -160,6 +160,11 @@ class Volume:
         matrix[:3, 3] = self.origin
         return matrix
 
+    def compares(self, other: Volume) -> bool:
+        """Tell whether this volume and another have places in one space; without origin and direction one has none."""
+        placed = (v.space or any(v.origin) or v.direction != IDENTITY for v in (self, other))
+        return self.space == other.space and all(placed)
+
     def check_grid(self, own: str, first: Volume, name: str, why: str) -> None:
         """Raise DataError unless this volume, called ``own``, has the grid of ``first``, called ``name``."""
         shift = np.abs(self.affine - first.affine).max() if self.dims == first.dims else np.inf
