@@ -74,6 +74,24 @@ def test_empty_attributes_of_hdf5_say_nothing(tmp_path: Path) -> None:
     assert (volume.quantity, volume.values_in) == ("", "")
 
 
+@pytest.mark.parametrize("how", ["label", "NAME"])
+def test_names_of_hdf5_dimensions_order_their_axes(tmp_path: Path, how: str) -> None:
+    with h5py.File(tmp_path / "v.h5", "w") as file:
+        field = file.create_dataset("field", data=VALUES.T)
+        for k, (name, values) in enumerate(AXES.items()):
+            file[f"scale_{name}"] = values
+            file[f"scale_{name}"].make_scale(name if how == "NAME" else "")
+            field.dims[k].attach_scale(file[f"scale_{name}"])
+            field.dims[k].label = name if how == "label" else ""
+    check_grid(read_volume(str(tmp_path / "v.h5")))
+    with h5py.File(tmp_path / "v.h5", "a") as file:
+        file["z_index"] = np.arange(len(AXES["z"]))
+        file["z_index"].make_scale("z_index")
+        file["field"].dims[2].attach_scale(file["z_index"])
+    with pytest.warns(UserWarning, match="/field: coordinates are those of scale_z, not of /z_index"):
+        check_grid(read_volume(str(tmp_path / "v.h5")))
+
+
 def test_netcdf_descending_axes_are_turned(tmp_path: Path) -> None:
     turned = {"x": X[::-1], "y": Y, "z": Z[::-1]}
     check_grid(read_volume(write_netcdf(tmp_path / "v.nc", axes=turned)))
@@ -99,7 +117,7 @@ def test_netcdf_irregular_axes_are_refused_or_resampled(tmp_path: Path) -> None:
     refused(UsageError, r"axis z has steps from 1 to 7; .*--dims X Y Z .*--spacing X Y Z", read_volume, path)
     volume = read_volume(path, ReadOptions(dims=(6, 5, 20)))
     assert volume.dims == (6, 5, 20)
-    assert volume.name == "v:field (resampled to 6 x 5 x 20)"
+    assert (volume.name, volume.unit) == ("v:field (resampled to 6 x 5 x 20)", "m")
     np.testing.assert_allclose(volume.spacing, (1 / 6, 0.3, 0.5))
     check_ramp(volume, atol=2e-3)
     assert np.isfinite(volume.data).all()

@@ -414,7 +414,7 @@ def _placed(
 
     points = [np.arange(a.size, dtype=float) if c is None else c for a, c in zip(axes, centres, strict=True)]
     data = (field * np.float64(scaling[0]) + scaling[1]).ravel()
-    return resample(points[::-1], data, options.dims, source, name)
+    return replace(resample(points[::-1], data, options.dims, source, name), unit=unit)
 
 
 def _left(

@@ -216,8 +216,12 @@ def scaled_axes(dataset: Any, read: Callable[[Any], Any]) -> list[Axis]:
             names = list(dimension.keys())
             axes.append(axis(dimension.label or (names[0] if names else ""), size))
             continue
-        scale = scales[0]
-        axes.append(axis(scale.name.rpartition("/")[2], size, *(() if _is_bare(scale) else read(scale))))
+        own = scales[0].name.rpartition("/")[2]
+        name = next((n for n in (dimension.label, *dimension.keys()) if axis(n, size).role), own)
+        if len(scales) > 1:
+            others = ", ".join(printable(scale.name) for scale in scales[1:])
+            warnings.warn(f"{printable(dataset.name)}: coordinates are those of {own}, not of {others}", stacklevel=3)
+        axes.append(axis(name, size, *(() if _is_bare(scales[0]) else read(scales[0]))))
     return axes
 
 
