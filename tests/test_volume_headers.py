@@ -111,6 +111,19 @@ def test_nrrd_components(tmp_path: Path, fields: dict, axis: int) -> None:
     refused(UsageError, "not component 2", read_volume, source, ReadOptions(component=2))
 
 
+@pytest.mark.parametrize("space", ["left-anterior-superior-time", "LAST"])
+@pytest.mark.parametrize("kinds", [{}, {"kinds": "space space space space"}])
+def test_nrrd_spaces_with_time(tmp_path: Path, space: str, kinds: dict) -> None:
+    """More steps than voxels along x."""
+    steps = np.stack([VALUES + k for k in range(6)]).astype("<i2")
+    place = {"space": space, "space directions": "(2,0,0,0) (0,3,0,0) (0,0,4,0) (0,0,0,7)", "space origin": "(1,2,3,0)"}
+    source = write(tmp_path / "v.nrrd", nrrd(place | kinds | {"dimension": 4, "sizes": "5 4 3 6"}, steps.tobytes()))
+    volume = read_volume(source, ReadOptions(time=4))
+    np.testing.assert_array_equal(volume.data, steps[4])
+    np.testing.assert_allclose(volume.affine, [[-2, 0, 0, -1], [0, 3, 0, 2], [0, 0, 4, 3], [0, 0, 0, 1]])
+    refused(UsageError, "6 time steps; expected one: try --time N", read_volume, source)
+
+
 @pytest.mark.parametrize(
     ("fields", "message"),
     [

@@ -80,12 +80,19 @@ def _vectors(fields: HeaderFields, n: int) -> list[list[float] | None] | None:
     tokens = re.findall(r"none|\([^)]*\)", fields["spacedirections"])
     if len(tokens) != n or "".join(tokens).replace(" ", "") != "".join(fields["spacedirections"].split()):
         raise DataError(f"{fields.name}: space directions {fields['spacedirections']!r}; expected {n} vectors or none")
-    return [None if token == "none" else _vector(fields, "space directions", token) for token in tokens]
+    rows = [None if token == "none" else _vector(fields, "space directions", token) for token in tokens]
+    timed = _space_name(fields).endswith("-time")  # time's axis steps along none of space
+    return [row if row is None or any(row) or not timed else None for row in rows]
+
+
+def _space_name(fields: HeaderFields) -> str:
+    """Return the name of the space in lower case, with ``-time`` where it has time."""
+    return re.sub("^(ras|las|lps)t$", r"\1-time", fields.get("space", "").lower())
 
 
 def _vector(fields: HeaderFields, key: str, text: str) -> list[float]:
     """Return a vector ``(x,y,z)`` of the header's space; the third of two dimensions is 0, a fourth is time's."""
-    space = fields.get("space", "").lower()
+    space = _space_name(fields)
     edge = fields.integer("spacedimension", 4 if space.endswith("-time") else 3 if space else text.count(",") + 1)
     inner = text.strip("() ")
     if inner.count(",") + 1 != edge:
@@ -193,7 +200,7 @@ def _third(axes: list[list[float]]) -> np.ndarray:
 
 def _space(fields: HeaderFields) -> tuple[np.ndarray, str | None]:
     """Return signs that make the file's coordinates right-handed, and the anatomical space that they then are in."""
-    name = fields.get("space", "").lower().removesuffix("-time")
+    name = _space_name(fields).removesuffix("-time")
     letters = "".join(word[:1] for word in name.split("-")) if name.count("-") == 2 else name
     if letters in ("ras", "lps"):
         return np.ones(3), letters.upper()
@@ -266,7 +273,8 @@ def _volume(path: Path, fields: HeaderFields, block: np.ndarray, sizes: list[int
     label = f"axis {axis}" if axis is not None else ""
     component, kinds = options.component, fields.get("kinds", "").lower()
     kind = dict(enumerate(kinds.split())).get(axis, "") if axis is not None else ""
-    if kind == "time" or (kind == "list" and _SEQUENCE.search(path.name)):
+    timed = _space_name(fields).endswith("-time") and kind in ("", "space", "domain")
+    if timed or kind == "time" or (kind == "list" and _SEQUENCE.search(path.name)):
         component = _step(block, options, str(path))
     elif options.time:
         raise UsageError(
