@@ -76,6 +76,14 @@ def test_imagej_sizes_that_are_half_known(tmp_path, text, tags, spacing, unit, t
     assert all(part in messages[0] for part in told)
 
 
+@pytest.mark.parametrize("text", ["unit=um\nspacing=2.0\n", "unit=pixel\n"])
+def test_the_origin_counts_in_pixels(tmp_path: Path, text: str) -> None:
+    """Of ij.measure.Calibration: getX(x) is (x - xOrigin) * pixelWidth."""
+    source = described(tmp_path / "a.tif", f"images=4\nslices=4\n{text}xorigin=3\nyorigin=-4\nzorigin=5\n", (4, 5, 1))
+    volume = read_volume(source)
+    np.testing.assert_allclose(volume.affine @ [3, -4, 5, 1], (0, 0, 0, 1), atol=1e-12)
+
+
 def test_sizes_that_are_no_numbers(tmp_path: Path) -> None:
     comma = described(tmp_path / "a.tif", "images=4\nslices=4\nunit=um\nspacing=2,5\n", (4, 4, 1))
     refused(UsageError, r"spacing is '2,5'; expected a number; try --spacing X Y Z", read_volume, comma)

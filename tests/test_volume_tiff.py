@@ -125,6 +125,9 @@ def test_samples_of_a_pixel_are_channels(tmp_path: Path, planar: str, compressio
     values = np.random.default_rng(0).integers(0, 255, (Z, Y, X, 3)).astype("u1")
     stored = values if planar == "contig" else np.moveaxis(values, -1, 1)
     tifffile.imwrite(tmp_path / "a.tif", stored, photometric="rgb", planarconfig=planar, compression=compression)
+    axes = {"axes": "ZYXS" if planar == "contig" else "ZSYX"}
+    tifffile.imwrite(tmp_path / "a.ome.tif", stored, photometric="rgb", planarconfig=planar, metadata=axes)
+    refused(UsageError, ": 3 components of type uint8;", read_volume, str(tmp_path / "a.ome.tif"))
     for c in range(3):
         volume = read_volume(str(tmp_path / "a.tif"), ReadOptions(component=c))
         np.testing.assert_array_equal(volume.data, values[..., c])

@@ -133,9 +133,11 @@ def read_tiff(path: Path, options: ReadOptions, slices: int = 1) -> Volume:
         warnings.warn(f"{path}: {'; '.join(doubts)} (--spacing X Y Z sets it)", stacklevel=2)
     if facts.scaling != (1.0, 0.0) and options.component == "magnitude":
         raise UsageError(f"{path}: calibrated values, of which no magnitude is taken; choose one channel")
+    origin = triple(0.0 - n * edge for n, edge in zip(facts.zero, volume.spacing, strict=True))
     return replace(
-        volume, unit=facts.length, slope=facts.scaling[0], intercept=facts.scaling[1], value_unit=facts.value_unit
-    )
+        volume, unit=facts.length, slope=facts.scaling[0], intercept=facts.scaling[1], value_unit=facts.value_unit,
+        origin=origin,
+    )  # fmt: skip
 
 
 def _number(text: str) -> float | None:
@@ -302,6 +304,7 @@ class Facts:
         scaling: slope and intercept of the values.
         value_unit: unit of the values; "" unknown.
         function: ImageJ's function that would calibrate the values, which is not read; None if there is none.
+        zero: voxel (x, y, z), counted from 0, whose centre is the world's origin.
     """
 
     spacing: tuple[float | None, float | None, float | None] = (None, None, None)
@@ -314,6 +317,7 @@ class Facts:
     scaling: tuple[float, float] = (1.0, 0.0)
     value_unit: str = ""
     function: Any = None
+    zero: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def doubts(self, options: ReadOptions, slices: int, source: str) -> list[str]:
         """Return what is assumed for the spacing; raise UsageError if it is unusable and none is given."""
@@ -347,7 +351,7 @@ def ome_facts(root: ElementTree.Element, series: int, name: str, count: int, pat
     names, colors = [], []
     for channel in (c for c in pixels if ome_tag(c) == "Channel"):
         name, samples = channel.get("Name", ""), int(channel.get("SamplesPerPixel", 1))
-        names += [name] if samples == 1 else [f"{name}:{k}" for k in range(min(samples, 1000))]
+        names += [name] if samples == 1 else [f"{name}:{k}" if name else "" for k in range(min(samples, 1000))]
         colors += [_color(channel.get("Color"))] * min(samples, 1000)
     return replace(_micrometres(sizes, units), channels=names if any(names) else [], colors=colors)
 
@@ -369,6 +373,7 @@ def imagej_facts(stated: dict[str, Any], resolution: tuple[float | None, float |
         scales = dict(zip(*(str(stated.get(key, "")).split(",") for key in ("axes", "scales")), strict=False))
         x, y, z = (_positive(scales.get(axis)) for axis in "XYZ")
         resolution, tag, stated = (x and 1 / x, y and 1 / y), 1, {"spacing": z, **stated}
+    zero = triple(_number(str(stated.get(f"{axis}origin", 0))) or 0.0 for axis in "xyz")
     channels, slices, frames = (int(stated.get(key, 1)) for key in ("channels", "slices", "frames"))
     images, assumed, name = channels * slices * frames, [], str(stated.get("unit", "")).strip()
     unit, per = _unit(name), _PER.get(tag, "")
@@ -383,7 +388,7 @@ def imagej_facts(stated: dict[str, Any], resolution: tuple[float | None, float |
                            f"taken per {per if metric else name}")  # fmt: skip
     depth = stated.get("spacing") or None
     if unit in ("", "pixel") and depth is None and not set(across) - {None, 1.0}:
-        return Facts(images=images)
+        return Facts(images=images, zero=zero)
     if None in across:
         assumed.append("no size of its pixels; taken as 1")
     if depth is None and max(images, int(stated.get("images", 1))) > channels * frames:
@@ -395,7 +400,7 @@ def imagej_facts(stated: dict[str, Any], resolution: tuple[float | None, float |
         "spacing": abs(depth) if isinstance(depth, float | int) else depth,
     }
     facts = _micrometres(sizes, [name, str(stated.get("yunit", name)), str(stated.get("zunit", name))])
-    return replace(facts, images=images, assumed=tuple(assumed))
+    return replace(facts, images=images, assumed=tuple(assumed), zero=zero)
 
 
 def _calibration(stated: dict[str, Any], kind: str) -> dict[str, Any]:
