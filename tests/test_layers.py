@@ -85,6 +85,8 @@ def test_a_mask_is_where_its_file_says(vvgt, tmp_path: Path) -> None:
         part = library.read_volume(tmp_path / "v.nii", mask=tmp_path / name, **how).data
         whole = values.T[:6, 2:, 1:4] if how else values.T
         np.testing.assert_array_equal(np.nan_to_num(part), np.where(whole > 60, whole, 0))
+    part = library.read_volume(tmp_path / "v.nii", mask=tmp_path / "m.nii", spacing=(3, 1, 2)).data
+    np.testing.assert_array_equal(np.nan_to_num(part), np.where(values.T > 60, values.T, 0))
     keep.affine[2, 3] += 1
     nibabel.save(nibabel.Nifti1Image(np.asarray(keep.dataobj), keep.affine), tmp_path / "m.nii")
     said = vvgt("info", tmp_path / "v.nii", "--mask", tmp_path / "m.nii").error

@@ -72,7 +72,10 @@ def cut(volume: Volume, options: ReadOptions) -> Volume:
     if mask is not None and box is not None and mask.dims == volume.dims:
         mask = crop(mask, box)
     volume = volume if box is None else crop(volume, box)
-    volume = volume if mask is None else masked(volume, mask, options.stored)
+    if mask is not None:
+        if options.spacing is not None:  # holds for both, whatever their files say
+            mask = replace(mask, spacing=volume.spacing, origin=volume.origin)
+        volume = masked(volume, mask, options.stored)
     if options.keep_largest is None:
         return volume
     return masked(volume, without_other_bodies(volume, options.keep_largest), options.stored)

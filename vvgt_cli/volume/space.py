@@ -75,7 +75,7 @@ def in_space(volume: Volume, wanted: str | None) -> Volume:
 def turned(volume: Volume, to: Volume) -> Volume:
     """Return a volume with its index axes in the order and directions of another's, if it has these axes in memory."""
     volume = in_space(volume, to.space) if volume.space and to.space else volume
-    signs = np.rint(np.linalg.inv(volume.affine) @ to.affine)[:3, :3]
+    signs = np.rint(np.linalg.inv(volume.axes) @ to.axes)
     across = np.abs(signs)
     apart = (across.sum(0) != 1).any() or (across.sum(1) != 1).any() or not volume.compares(to)
     if apart or isinstance(volume.data, Stored):
