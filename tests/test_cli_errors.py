@@ -29,6 +29,7 @@ def folder(tmp_path, monkeypatch):
     Path("clear.json").write_text(json.dumps({"range": [0, 255], "points": clear}))
     Path("broken.json").write_text('{"range": [0, 255], "points": [')
     Path("gaussians.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\n")
+    np.save("none.npy", np.zeros((4, 0, 4)))
     Path("not.ply").write_bytes(b"solid cube\n")
     return tmp_path
 
@@ -60,6 +61,11 @@ CASES = {
         "a .ply (Gaussians, points or a mesh); expected",
     ),
     "no output": (("convert", "v.raw", *RAW), 2, "--output"),
+    "empty output": ((*CONVERT[:-1], ""), 2, "'-o' / '--output': '' is empty; expected a value"),
+    "empty report": ((*CONVERT, "--report", ""), 2, "'--report': '' is empty"),
+    "empty function": ((*CONVERT, "--tf", "good.json", "--tf", ""), 2, "'--tf': '' is empty"),
+    "empty volume": (("info", ""), 2, "'' is empty; expected"),
+    "no voxel": (("info", "none.npy"), 1, "none.npy: 0 values; expected at least one along each axis"),
     "budget": ((*CONVERT, "--max-gaussians", 0), 2, "--max-gaussians"),
     "degree": ((*CONVERT, "--sh-degree", 4), 2, "--sh-degree"),
     "max-megabytes unit": (

@@ -83,7 +83,7 @@ def check_outputs(outputs: Sequence[Output], inputs: Sequence[str | None], overw
         place = output.path if output.path == STDOUT else os.path.realpath(output.path)
         if place in sources:
             raise UsageError(f"{output.option} {output.path}: is an input of this run; choose another name")
-        if place in taken:
+        if place in taken and place != os.devnull:
             raise UsageError(f"{output.option} and {taken[place]}: both write to {output.path}; choose two names")
         taken[place] = output.option
 
