@@ -85,6 +85,15 @@ CASES = {
     "ply": (("info", "not.ply"), None, "not.ply"),
     "render no ply": (("render", "not.ply", "--orbit", 2, "-o", "d"), 1, "not.ply"),
     "render no views": (("render", "not.ply", "-o", "d"), 2, "--orbit"),
+    **{
+        f"{name} to a stream": ((*words, "-o", "-"), 2, "-o -: standard output takes no folder; expected a folder's")
+        for name, words in {
+            "render": ("render", "v.raw", *RAW, "--orbit", 2),
+            "views": ("render-views", "v.raw", *RAW),
+            "bands": ("tf", "suggest", "v.raw", *RAW),
+            "report": ("report", "v.raw", *RAW),
+        }.items()
+    },
     "render both": (("render", "not.ply", "-o", "d", "--orbit", 1, "--camera", "c.json"), 2, "either"),
     "render background": (("render", "not.ply", "-o", "d", "--orbit", 1, "--background", 0, 0, 255), 2, "[0, 1]"),
     "render cameras": (("render", "not.ply", "-o", "d", "--camera", "good.json"), 1, "frames"),

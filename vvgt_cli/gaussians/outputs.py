@@ -106,6 +106,8 @@ def claimed(outputs: Sequence[Output], inputs: Sequence[str | None], overwrite: 
 
 def check_folder(folder: Path, content: str) -> None:
     """Raise UsageError unless a folder for ``content`` is there or can be made."""
+    if str(folder) == STDOUT:
+        raise UsageError(f"-o -: standard output takes no folder; expected a folder's name for the {content}")
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"-o {folder}: is a file; expected a directory for the {content}")
     if not folder.parent.is_dir():
