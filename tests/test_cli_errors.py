@@ -29,6 +29,7 @@ def folder(tmp_path, monkeypatch):
     Path("clear.json").write_text(json.dumps({"range": [0, 255], "points": clear}))
     Path("broken.json").write_text('{"range": [0, 255], "points": [')
     Path("gaussians.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\n")
+    np.save("none.npy", np.zeros((4, 0, 4)))
     Path("not.ply").write_bytes(b"solid cube\n")
     return tmp_path
 
@@ -60,6 +61,11 @@ CASES = {
         "a .ply (Gaussians, points or a mesh); expected",
     ),
     "no output": (("convert", "v.raw", *RAW), 2, "--output"),
+    "empty output": ((*CONVERT[:-1], ""), 2, "'-o' / '--output': '' is empty; expected a value"),
+    "empty report": ((*CONVERT, "--report", ""), 2, "'--report': '' is empty"),
+    "empty function": ((*CONVERT, "--tf", "good.json", "--tf", ""), 2, "'--tf': '' is empty"),
+    "empty volume": (("info", ""), 2, "'' is empty; expected"),
+    "no voxel": (("info", "none.npy"), 1, "none.npy: 0 values; expected at least one along each axis"),
     "budget": ((*CONVERT, "--max-gaussians", 0), 2, "--max-gaussians"),
     "degree": ((*CONVERT, "--sh-degree", 4), 2, "--sh-degree"),
     "max-megabytes unit": (
@@ -79,6 +85,15 @@ CASES = {
     "ply": (("info", "not.ply"), None, "not.ply"),
     "render no ply": (("render", "not.ply", "--orbit", 2, "-o", "d"), 1, "not.ply"),
     "render no views": (("render", "not.ply", "-o", "d"), 2, "--orbit"),
+    **{
+        f"{name} to a stream": ((*words, "-o", "-"), 2, "-o -: standard output takes no folder; expected a folder's")
+        for name, words in {
+            "render": ("render", "v.raw", *RAW, "--orbit", 2),
+            "views": ("render-views", "v.raw", *RAW),
+            "bands": ("tf", "suggest", "v.raw", *RAW),
+            "report": ("report", "v.raw", *RAW),
+        }.items()
+    },
     "render both": (("render", "not.ply", "-o", "d", "--orbit", 1, "--camera", "c.json"), 2, "either"),
     "render background": (("render", "not.ply", "-o", "d", "--orbit", 1, "--background", 0, 0, 255), 2, "[0, 1]"),
     "render cameras": (("render", "not.ply", "-o", "d", "--camera", "good.json"), 1, "frames"),

@@ -147,6 +147,7 @@ def test_few_gaussians_have_few_cells_and_it_is_said_why_there_are_no_more(monke
     scene = scene_of(noise((24, 24, 24)), Tent(0.5, 0.3))
     forms = [closed_form_module.closed_form(scene, budget, 400) for budget in (10, 10**6)]
     assert len(forms[0].tree) < len(forms[1].tree) / 3
+    assert [closed_form_module.used_up(count, 100) for count in (91, 92)] == [False, True]
     assert closed_form_module.bound(forms[1]) == "the screen cannot tell smaller cells apart"
     monkeypatch.setattr(closed_form_module, "MAX_BASE_CELLS", 300)
     fewer = closed_form_module.closed_form(scene, 10**6, 400)

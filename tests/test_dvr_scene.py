@@ -225,3 +225,10 @@ def test_a_segment_that_enters_the_nodes_range_is_weighed_by_the_part_within_it(
     within, beyond = (view(volume, Band(*ends)) for ends in ((0.43, 0.52), (-1.0, 2.0)))
     assert beyond.max() > 0.3
     assert np.abs(within - beyond).max() < 0.01  # 0.1 where the table ends with the nodes
+
+
+@pytest.mark.parametrize("kind", ["u1", "f4", "f8"])
+def test_a_volume_of_zeros_is_as_visible_as_one_of_ones(kind):
+    zeros, ones = (view(Volume(np.full((9, 9, 9), value, kind)), Ramp(value - 1, value)) for value in (0, 1))
+    assert ones.max() > 0.3
+    assert np.array_equal(zeros, ones)

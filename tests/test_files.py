@@ -74,6 +74,20 @@ def test_where_there_are_no_locks_everyone_may_write(tmp_path, monkeypatch):
         assert list(tmp_path.iterdir()) == []
 
 
+def test_a_link_stays_and_its_file_is_written(tmp_path):
+    (tmp_path / "scratch").mkdir()
+    link, place = tmp_path / "a.ply", tmp_path / "scratch" / "b.ply"
+    link.symlink_to(place)
+    for content, overwrite in ((b"1", False), (b"2", True)):
+        with atomic_write(link, overwrite) as temporary:
+            temporary.write_bytes(content)
+        assert (link.is_symlink(), place.read_bytes()) == (True, content)
+    assert [path.name for path in place.parent.iterdir()] == ["b.ply"]
+    (tmp_path / "c.ply").symlink_to(tmp_path / "none" / "c.ply")
+    with pytest.raises(UsageError, match="none does not exist"), atomic_write(tmp_path / "c.ply"):
+        pass
+
+
 def test_a_full_disk_is_reported_before_the_work(tmp_path, vvgt, monkeypatch):
     monkeypatch.chdir(tmp_path)
     disk = {"f_frsize": 512, "f_blocks": 1000, "f_bavail": 4}

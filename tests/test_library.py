@@ -3,6 +3,7 @@
 import doctest
 import html
 import json
+import math
 import re
 from importlib import import_module
 from inspect import signature
@@ -188,12 +189,31 @@ def test_a_result_is_refined_and_read_again(field, converted, tmp_path):
         (np.zeros((4, 4, 4)), {"component": 1}, "an array is one volume"),
         (np.zeros((4, 4, 4)), {"max_gaussian": 5}, "max_gaussian: unknown option; expected one of dims, "),
         (np.zeros((4, 4, 4)), {"space": "RAS"}, "give affine too"),
+        (np.zeros((4, 4, 4)), {"spacing": 2}, "spacing: 2; expected three numbers"),
+        (np.zeros((4, 4, 4)), {"crop": (slice(1, 3),) * 3}, "crop: .*; expected text"),
+        (np.zeros((4, 4, 4)), {"light": "headlight"}, "light: unknown option; of a look: vvgt.Look"),
         ("example:blob:8", {"affine": np.eye(4)}, "affine and origin are for arrays"),
         (pyvista.ImageData(dimensions=(3, 3, 3)), {}, "array"),
     ],
 )
 def test_bad_input_is_an_exception_that_says_what(volume, reading, words):
     refused(vvgt.VvgtError, words, vvgt.read_volume, volume, **reading)
+
+
+def test_arguments_of_another_type_are_a_line(field, tmp_path):
+    refused(vvgt.UsageError, "tf: 3; expected a file, a name", vvgt.convert, field, 3)
+    for option, given in (("max_gaussians", 10.5), ("steps", "3"), ("screen", 64.5), ("max_gaussians", math.inf)):
+        words = f"{option} {given!r}: expected a whole number"
+        refused(vvgt.UsageError, words, vvgt.convert, field, TF, **{option: given})
+    for name in ("none.ply", "none.spz", ""):
+        refused(vvgt.DataError, "; expected a file of Gaussians", vvgt.read_ply, tmp_path / name)
+
+
+def test_numbers_of_gaussians_may_be_floats_and_labels_names():
+    organs = np.arange(512).reshape(8, 8, 8) // 256
+    result = vvgt.convert(organs, vvgt.Look(labels={0: "left", 1: "right"}), max_gaussians=1e2, screen=32, steps=0)
+    assert 0 < len(result.gaussians) <= 100
+    assert '"right"' in str(result.ply.legend)
 
 
 def test_saving_again_replaces_the_file_unless_forbidden(converted, tmp_path):

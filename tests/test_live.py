@@ -317,6 +317,7 @@ def test_what_a_live_file_does_not_go_with(vvgt, tmp_path) -> None:
     ):
         done = vvgt.fails(2, "convert", "example:blob:12", "--live", "-o", tmp_path / "a.ply", *SMALL, *option)
         assert option[0] in done
+    vvgt.ok("convert", "example:blob:12", "--live", "-o", tmp_path / "none.ply", *SMALL, "--steps", 0)
     for other, line in ((("--dry-run",), "--dry-run with --live"), (("--tf", "viridis", "--tf", "magma"), "one --tf")):
         assert line in vvgt.fails(2, "convert", "example:blob:12", "--live", "-o", tmp_path / "a.ply", *SMALL, *other)
     np.save(tmp_path / "four.npy", np.random.default_rng(0).random((2, 6, 7, 8)))

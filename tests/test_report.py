@@ -169,7 +169,7 @@ def test_compare_reads_reports_and_conversions_and_gives_them_different_names(sc
     ("args", "message"),
     [
         (("report", "-", "-o", "x"), "every run reads it again"),
-        (("report", "example:blob", "-o", "-"), "a folder of files"),
+        (("report", "example:blob", "-o", "-"), "takes no folder"),
         (("report", "example:blob", "-o", "no/where"), "no directory no"),
         (("report", "example:blob", "-o", "file"), "is a file"),
         (("report", "example:blob", "example:slab", "-o", "x"), "2 volumes; expected one"),

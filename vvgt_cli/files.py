@@ -103,8 +103,9 @@ def check_target(path: str | os.PathLike[str], overwrite: bool = False) -> Path:
         return target
     if target.is_dir():
         raise UsageError(f"{target} is a folder; expected the name of a file to write")
-    if not target.parent.is_dir():
-        raise UsageError(f"{target}: the folder {target.parent} does not exist; make it first")
+    folder = (Path(os.path.realpath(target)) if target.is_symlink() else target).parent
+    if not folder.is_dir():
+        raise UsageError(f"{target}: the folder {folder} does not exist; make it first")
     if target.exists() and not overwrite:
         raise UsageError(f"{target} exists; give --overwrite to replace it, or another name")
     return target
@@ -139,7 +140,8 @@ def atomic_write(path: str | os.PathLike[str], overwrite: bool = False) -> Itera
     target = check_target(path, overwrite)
     stream = is_stream(target)
     name = f".{target.stem[:80]}.{secrets.token_hex(4)}{target.suffix}"
-    temporary = Path(tempfile.gettempdir(), name) if stream else target.with_name(name)
+    place = Path(os.path.realpath(target))  # a link stays, as with the shell's >
+    temporary = Path(tempfile.gettempdir(), name) if stream else place.with_name(name)
     _leftovers.add(temporary)
     try:
         yield temporary
@@ -148,7 +150,7 @@ def atomic_write(path: str | os.PathLike[str], overwrite: bool = False) -> Itera
                 shutil.copyfileobj(source, sink)
         else:
             check_target(target, overwrite)  # it may have appeared meanwhile
-            os.replace(temporary, target)
+            os.replace(temporary, place)
     except BrokenPipeError:
         raise
     except OSError as error:

@@ -408,8 +408,6 @@ def _distinct(series: list[ReportRuns]) -> list[ReportRuns]:
 def _folder(output: str, names: Sequence[str], overwrite: bool, inputs: Sequence[str] = ()) -> Path:
     """Return the folder if all files may be written there."""
     folder = Path(output)
-    if output == STDOUT:
-        raise UsageError("-o -: a report is a folder of files; expected a folder's name")
     check_folder(folder, "report")
     if not os.access(folder if folder.is_dir() else folder.parent, os.W_OK):
         raise UsageError(f"-o {folder}: is not writable; choose another folder")

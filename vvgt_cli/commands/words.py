@@ -153,7 +153,14 @@ class SectionedCommand(click.Command):
         given = list(args)
         try:
             self._check_repeated(ctx, list(args))
-            return super().parse_args(ctx, args)
+            left = super().parse_args(ctx, args)
+            for param in self.params:
+                value = ctx.params.get(param.name)
+                if value == "" or (isinstance(value, tuple) and "" in value):
+                    raise click.BadParameter(
+                        "'' is empty; expected a value (is a variable of the shell unset?)", ctx, param
+                    )
+            return left
         except click.UsageError as error:
             files = [word for word in given if os.path.exists(word)]
             if "unexpected extra argument" not in error.message or len(files) < 2:

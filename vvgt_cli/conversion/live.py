@@ -58,7 +58,7 @@ def check_live(request: ConvertRequest) -> None:
         "--target-psnr": fit.target_psnr is not None,
         "--time-budget": fit.time_budget is not None,
         "--max-megabytes (or write a page, -o OUT.html)": fit.max_megabytes is not None and not is_page(request.output),
-        "--steps": fit.steps is not None,
+        "--steps": bool(fit.steps),
         "--model": fit.model is not None,
         "--init": fit.init != "moments",
         "--checkpoint": request.checkpoint is not None,

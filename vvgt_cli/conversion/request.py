@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from numbers import Real
 from typing import Any
 
 from vvgt_cli.conversion.place import AUTO
@@ -62,7 +63,13 @@ class FitOptions:
     max_megabytes: float | None = None
 
     def __post_init__(self) -> None:
-        """Check the limits."""
+        """Check the limits; take whole numbers such as 1e5 for integers."""
+        for name in ("max_gaussians", "screen", "steps", "seed"):
+            given = getattr(self, name)
+            if given is not None or name != "steps":
+                if not isinstance(given, Real) or float(given) % 1 != 0:  # NaN and infinity too
+                    raise UsageError(f"{name} {given!r}: expected a whole number")
+                object.__setattr__(self, name, int(given))
         if self.target_psnr is not None and not 0 <= self.target_psnr <= 150:
             raise UsageError(f"--target-psnr {self.target_psnr:g}: expected 0 to 150 dB")
         if self.time_budget is not None and not 0 < self.time_budget < math.inf:

@@ -83,7 +83,7 @@ def check_outputs(outputs: Sequence[Output], inputs: Sequence[str | None], overw
         place = output.path if output.path == STDOUT else os.path.realpath(output.path)
         if place in sources:
             raise UsageError(f"{output.option} {output.path}: is an input of this run; choose another name")
-        if place in taken:
+        if place in taken and place != os.devnull:
             raise UsageError(f"{output.option} and {taken[place]}: both write to {output.path}; choose two names")
         taken[place] = output.option
 
@@ -106,6 +106,8 @@ def claimed(outputs: Sequence[Output], inputs: Sequence[str | None], overwrite: 
 
 def check_folder(folder: Path, content: str) -> None:
     """Raise UsageError unless a folder for ``content`` is there or can be made."""
+    if str(folder) == STDOUT:
+        raise UsageError(f"-o -: standard output takes no folder; expected a folder's name for the {content}")
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"-o {folder}: is a file; expected a directory for the {content}")
     if not folder.parent.is_dir():

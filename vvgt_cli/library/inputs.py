@@ -36,7 +36,7 @@ from vvgt_cli.volume.stored import Stored
 PathLike = str | os.PathLike[str]
 VolumeLike: TypeAlias = "PathLike | Volume | OpenedFile | ReadAlready | ArrayLike | VtkImage"
 LightLike = LightOptions | Mapping[str, Any] | str | Sequence[float] | Sequence[str | Sequence[float]] | None
-LabelsLike = PathLike | Mapping[Any, Mapping[str, Any]] | LabelTable
+LabelsLike = PathLike | Mapping[Any, Mapping[str, Any] | str | int] | LabelTable
 LayerLike = PathLike | SourceRequest
 FunctionLike = PathLike | Mapping[str, Any] | TransferFunction
 
@@ -80,7 +80,8 @@ class Look:
         light: "none", "headlight", a direction (x, y, z) or its name, several of these, or `LightOptions` or a mapping
             of their attributes; None: that of the function or label table (of the first layer), as presets such as
             ct-bone have.
-        labels: table of a label map: a file, a mapping {label: {"name", "color", "opacity"}}, "auto" or "none".
+        labels: table of a label map: a file, a mapping {label: {"name", "color", "opacity"}} or {label: name}, "auto"
+            or "none".
         layers: volumes overlaid on it: values of ``--layer``, or `SourceRequest`.
         iso: a level of an isosurface or several, as values of ``--iso``, in place of ``tf``.
     """
@@ -223,12 +224,17 @@ def _options(reading: Mapping[str, Any]) -> ReadOptions:
     """Return the reading options of a caller; raise UsageError if one is unknown."""
     given = dict(reading)
     if unknown := sorted(set(given) - set(Reading.__annotations__)):
-        raise UsageError(f"{unknown[0]}: unknown option; expected one of {', '.join(Reading.__annotations__)}")
+        look = "; of a look: vvgt.Look(tf, ...)" if unknown[0] in Look.__annotations__ else ""
+        raise UsageError(f"{unknown[0]}: unknown option{look}; expected one of {', '.join(Reading.__annotations__)}")
     if "affine" in given or "origin" in given:
         raise UsageError("affine and origin are for arrays, and files have their own; remove them")
     for key in ("dims", "spacing"):
         if given.get(key) is not None:
+            if np.ndim(given[key]) != 1:
+                raise UsageError(f"{key}: {given[key]!r}; expected three numbers, along x, y and z")
             given[key] = tuple(float(v) if key == "spacing" else int(v) for v in given[key])
+    if not isinstance(given.get("crop", ""), str | None):
+        raise UsageError(f"crop: {given['crop']!r}; expected text, as '10:200,:,:64' (x, y, z)")
     if isinstance(parts := given.get("component"), list | tuple):
         given["component"] = parts[0] if len(parts) == 1 else ",".join(map(str, parts))
     if given.get("mask") is not None and not isinstance(given["mask"], str | Volume):
@@ -247,6 +253,8 @@ def function_of(tf: FunctionLike | None) -> str | TransferFunction | None:
 
     if isinstance(tf, Mapping):
         return read_transfer_function(tf)
+    if not isinstance(tf, str | os.PathLike | TransferFunction | None):
+        raise UsageError(f"tf: {tf!r:.80}; expected a file, a name, a mapping or a TransferFunction")
     return os.fspath(tf) if isinstance(tf, os.PathLike) else tf
 
 
@@ -309,7 +317,8 @@ def labels_of(labels: LabelsLike | None) -> str | LabelTable | None:
     Raise DataError for a mapping that is not a table.
     """
     if isinstance(labels, Mapping):
-        return table_of({str(number): dict(entry) for number, entry in labels.items()}, "labels")
+        entries = {str(key): dict(entry) if isinstance(entry, Mapping) else entry for key, entry in labels.items()}
+        return table_of(entries, "labels")
     return os.fspath(labels) if isinstance(labels, os.PathLike) else labels
 
 

@@ -163,6 +163,8 @@ def load_block(
 def _too_short(path: Path, size: int, shape: tuple[int, ...], dtype: np.dtype, offset: int) -> DataError:
     dims = " x ".join(str(n) for n in reversed(shape))
     need = count(shape) * dtype.itemsize + offset
+    if need == offset:
+        return DataError(f"{path.name}: {dims} values; expected at least one along each axis")
     return DataError(
         f"{path.name}: the file has {size_text(size)}; {dims} values of {dtype.name} after {offset} bytes need "
         f"{size_text(need)}; check that the file is whole and that its header's sizes and type are right"

@@ -122,7 +122,7 @@ def is_splats(path: str | Path) -> bool:
     if format_of(path) or Path(path).name.lower().endswith(".ply") or split_name(path):
         return True
     try:
-        with open(seekable(path), "rb") as stream:
+        with open(_there(path), "rb") as stream:
             return stream.read(4) in (b"ply\n", b"ply\r")
     except OSError:
         return False
@@ -152,7 +152,7 @@ def read_columns(path: str | Path) -> Splats:
     if streamed is not None:
         return StreamedLevels(streamed[0]).level(streamed[1])
     known = format_of(path) or _compressed(path)
-    place, name = seekable(path), str(path)
+    place, name = _there(path), str(path)
     if known is not None:
         if place.stat().st_size > _LARGEST:
             raise DataError(f"{path}: more than 4 GiB; expected a smaller file in this format, or a standard .ply")
@@ -164,7 +164,15 @@ def read_columns(path: str | Path) -> Splats:
         return columns_of(content, name)
 
 
+def _there(path: str | Path) -> Path:
+    """Return the path to read from, or raise DataError where no file is."""
+    place = seekable(path)
+    if not place.exists() or place.is_dir():
+        raise DataError(f"{path}: {'a folder' if place.is_dir() else 'no such file'}; expected a file of Gaussians")
+    return place
+
+
 def _compressed(path: str | Path) -> Format | None:
     """Return the format of a `.compressed.ply` that has another name, else None."""
-    with open(seekable(path), "rb") as stream:
+    with open(_there(path), "rb") as stream:
         return format_of(".compressed.ply") if b"\nelement chunk " in stream.read(_HEAD) else None
