@@ -158,7 +158,10 @@ def main(
         page = folder / f"{name}.html"
         volume = load(source_of(file, begun, reading)).volume
         width, turned = volume.dims[0], volume.axes[0, 0] < 0
-        half, share = Reading(crop=f":{width - width // 2},:,:" if turned else f"{width // 2}:,:,:"), width // 2 / width
+        begin, _, rest = reading.get("crop", ":,:,:").partition(":")
+        first, rest = int(begin or 0), rest.partition(",")[2]
+        x = f"{first}:{first + width - width // 2}" if turned else f"{first + width // 2}:{first + width}"
+        half, share = Reading(crop=f"{x},{rest}"), width // 2 / width
         if not page.exists():
             vvgt.convert(file, begun, page, max_gaussians=500, screen=64, steps=0, **reading)
         person = person or Person((size, size))

@@ -27,6 +27,7 @@ from vvgt_cli.look.labels import distinct
 from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.volume import ReadOptions, Volume, read_volume
 from vvgt_cli.volume.options import crop, masked, parse_crop
+from vvgt_cli.volume.registry import cut
 
 TURNED = (0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
@@ -89,8 +90,22 @@ def test_a_mask_is_where_its_file_says(vvgt, tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.nan_to_num(part), np.where(values.T > 60, values.T, 0))
     keep.affine[2, 3] += 1
     nibabel.save(nibabel.Nifti1Image(np.asarray(keep.dataobj), keep.affine), tmp_path / "m.nii")
+    part = library.read_volume(tmp_path / "v.nii", mask=tmp_path / "m.nii", spacing=(1, 1, 1)).data
+    np.testing.assert_array_equal(np.nan_to_num(part), np.where(values.T > 60, values.T, 0))
     said = vvgt("info", tmp_path / "v.nii", "--mask", tmp_path / "m.nii").error
     assert re.search("--mask m: 5 x 6 x 7 voxels.*; expected the grid of v", said), said
+
+
+@pytest.mark.parametrize("how", [{}, {"crop": "1:,:2,:"}, {"spacing": (1, 2, 3)}])
+def test_a_mask_without_a_place_is_applied_voxel_by_voxel(how: dict) -> None:
+    place = {"direction": (0, 1, 0, 1, 0, 0, 0, 0, -1), "origin": (5, 0, 0), "spacing": (2, 2, 2)}
+    keep = np.random.default_rng(4).integers(0, 2, (3, 4, 5)).astype(np.uint8)
+    volume = Volume(np.ones((3, 4, 5), np.float32), **place)
+    for mask in (Volume(keep), replace(volume, data=keep, unit="m", spacing=(2e-3,) * 3, origin=(5e-3, 0, 0))):
+        part = cut(replace(volume, unit="mm"), ReadOptions(mask=mask, **how)).data
+        np.testing.assert_array_equal(np.isfinite(part), keep[:, :2, 1:] if "crop" in how else keep)
+    with pytest.warns(UserWarning, match="--mask lost: states no place; applied voxel by voxel"):
+        cut(replace(volume, space="RAS"), ReadOptions(mask=Volume(keep, space="RAS", name="lost"), **how))
 
 
 def test_of_scalars_and_labels_on_the_command_line(vvgt, tmp_path: Path) -> None:

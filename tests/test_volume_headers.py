@@ -122,6 +122,11 @@ def test_nrrd_spaces_with_time(tmp_path: Path, space: str, kinds: dict) -> None:
     np.testing.assert_array_equal(volume.data, steps[4])
     np.testing.assert_allclose(volume.affine, [[-2, 0, 0, -1], [0, 3, 0, 2], [0, 0, 4, 3], [0, 0, 0, 1]])
     refused(UsageError, "6 time steps; expected one: try --time N", read_volume, source)
+    place["space directions"] = "none (2,0,0,0) (0,3,0,0) (0,0,4,0)"
+    parts = np.stack([VALUES + k for k in range(6)], -1).astype("<i2")
+    source = write(tmp_path / "p.nrrd", nrrd(place | {"dimension": 4, "sizes": "6 5 4 3"}, parts.tobytes()))
+    np.testing.assert_array_equal(read_volume(source, ReadOptions(component=2)).data, parts[..., 2])
+    refused(UsageError, "no axis of time", read_volume, source, ReadOptions(time=2))
 
 
 @pytest.mark.parametrize(

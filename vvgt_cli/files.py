@@ -96,6 +96,11 @@ def _spool(path: str | os.PathLike[str]) -> IO[bytes]:
     return kept
 
 
+def linked(path: str | os.PathLike[str]) -> Path:
+    """Return the file that is written by a path's name, that of a link elsewhere: links stay, as with the shell's >."""
+    return Path(os.path.realpath(path) if os.path.islink(path) else path)
+
+
 def check_target(path: str | os.PathLike[str], overwrite: bool = False) -> Path:
     """Return the path as a `Path` if it can be written, a new file, a pipe or a device, or raise UsageError."""
     target = Path(path)
@@ -103,7 +108,7 @@ def check_target(path: str | os.PathLike[str], overwrite: bool = False) -> Path:
         return target
     if target.is_dir():
         raise UsageError(f"{target} is a folder; expected the name of a file to write")
-    folder = (Path(os.path.realpath(target)) if target.is_symlink() else target).parent
+    folder = linked(target).parent
     if not folder.is_dir():
         raise UsageError(f"{target}: the folder {folder} does not exist; make it first")
     if target.exists() and not overwrite:
@@ -113,7 +118,7 @@ def check_target(path: str | os.PathLike[str], overwrite: bool = False) -> Path:
 
 def check_disk_space(path: str | os.PathLike[str], need: int) -> None:
     """Raise DataError, in the system's own words for a full disk, unless that of ``path`` has ``need`` bytes free."""
-    folder = Path(path).parent
+    folder = linked(path).parent
     if is_stream(path) or not hasattr(os, "statvfs"):
         return
     with suppress(OSError):
@@ -140,7 +145,7 @@ def atomic_write(path: str | os.PathLike[str], overwrite: bool = False) -> Itera
     target = check_target(path, overwrite)
     stream = is_stream(target)
     name = f".{target.stem[:80]}.{secrets.token_hex(4)}{target.suffix}"
-    place = Path(os.path.realpath(target))  # a link stays, as with the shell's >
+    place = linked(target)
     temporary = Path(tempfile.gettempdir(), name) if stream else place.with_name(name)
     _leftovers.add(temporary)
     try:
@@ -188,7 +193,7 @@ def claim(path: str | os.PathLike[str]) -> Iterator[None]:
     Raises:
         UsageError: another process holds the lock.
     """
-    target = Path(path)
+    target = linked(path)
     lock = target.with_name(f".{target.name[:200]}.lock")
     held = None if is_stream(target) else _lock(lock, target)
     try:

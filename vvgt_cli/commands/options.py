@@ -90,7 +90,7 @@ _READ = dict(
         "--crop", metavar="X0:X1,Y0:Y1,Z0:Z1",
         help="Range of voxels to keep, as Python slices: counted from 0, end excluded, either bound optional.",
     ),
-    mask=click.option("--mask", metavar="FILE", help="Volume of the same size; voxels where it is 0 are hidden."),
+    mask=click.option("--mask", metavar="FILE", help="Volume of the same grid; voxels where it is 0 are hidden."),
     keep_largest=click.option(
         "--keep-largest", type=float, metavar="VALUE",
         help="Of what lies above VALUE, hide all but the largest connected body: -300 removes the head rest of a CT. "

@@ -155,7 +155,7 @@ class SectionedCommand(click.Command):
             self._check_repeated(ctx, list(args))
             left = super().parse_args(ctx, args)
             for param in self.params:
-                value = ctx.params.get(param.name)
+                value = None if param.name == "array" or ctx.resilient_parsing else ctx.params.get(param.name)
                 if value == "" or (isinstance(value, tuple) and "" in value):
                     raise click.BadParameter(
                         "'' is empty; expected a value (is a variable of the shell unset?)", ctx, param

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from numbers import Real
 from typing import Any
 
 from vvgt_cli.conversion.place import AUTO
@@ -67,9 +66,13 @@ class FitOptions:
         for name in ("max_gaussians", "screen", "steps", "seed"):
             given = getattr(self, name)
             if given is not None or name != "steps":
-                if not isinstance(given, Real) or float(given) % 1 != 0:  # NaN and infinity too
+                try:
+                    object.__setattr__(self, name, int(given))
+                    whole = bool(getattr(self, name) == given)
+                except (TypeError, ValueError, OverflowError):  # NaN and infinity too
+                    whole = False
+                if not whole:
                     raise UsageError(f"{name} {given!r}: expected a whole number")
-                object.__setattr__(self, name, int(given))
         if self.target_psnr is not None and not 0 <= self.target_psnr <= 150:
             raise UsageError(f"--target-psnr {self.target_psnr:g}: expected 0 to 150 dB")
         if self.time_budget is not None and not 0 < self.time_budget < math.inf:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from vvgt_cli.errors import UsageError
-from vvgt_cli.files import atomic_write, check_disk_space, check_target, claim, is_stream
+from vvgt_cli.files import atomic_write, check_disk_space, check_target, claim, is_stream, linked
 from vvgt_cli.gaussians.formats import ready
 
 STDOUT = "-"
@@ -56,8 +56,8 @@ def _check_one(output: Output, overwrite: bool) -> None:
         check_target(path, overwrite)
     except UsageError as error:
         raise UsageError(f"{output.option}: {error}") from None
-    if not os.access(path.parent, os.W_OK):
-        raise UsageError(f"{output.option} {path}: directory {path.parent} is not writable; choose another")
+    if not os.access(linked(path).parent, os.W_OK):
+        raise UsageError(f"{output.option} {path}: directory {linked(path).parent} is not writable; choose another")
     check_disk_space(path, SMALLEST)
     if output.splats:
         ready(path)

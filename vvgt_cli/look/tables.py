@@ -145,7 +145,7 @@ def build_tables(
     lo, hi, beside = max(value_range[0], first), min(value_range[1], last), 1.0
     if not hi > lo:  # data wholly beyond one end node, or a constant: one value of the function is used
         lo = hi = min(max(value_range[0], first), last)
-        hi = lo + max(abs(lo), 1e-20) * 1e-6  # such that the bins of a stored unit fit into float32
+        hi = lo + max(abs(lo) * 1e-6, 1e-20)  # such that the bins of a stored unit fit into float32
     else:
         margin = BESIDE * (hi - lo)
         wide = max(value_range[0], lo - margin), min(value_range[1], hi + margin)

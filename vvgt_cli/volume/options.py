@@ -166,15 +166,13 @@ def masked(volume: Volume, mask: Volume, stored: bool = False) -> Volume:
     Where it is ``stored``, that is done block by block.
 
     Raises:
-        DataError: a mask of another size or place, or one that keeps nothing (of a stored one only its blocks know).
+        DataError: a mask of another size, or one that keeps nothing (of a stored one only its blocks know).
     """
     if mask.dims != volume.dims:
         given, wanted = (" x ".join(map(str, v.dims)) for v in (mask, volume))
         raise DataError(
             f"--mask {mask.name}: {given} voxels; expected the {wanted} of {volume.name}: resample it onto that grid"
         )
-    if mask.compares(volume):
-        mask.check_grid(f"--mask {mask.name}", volume, volume.name, "resample it onto that grid")
     kind = float_dtype(volume.data.dtype)
 
     def block(slices: tuple[slice, ...]) -> np.ndarray:

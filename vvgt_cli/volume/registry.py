@@ -23,7 +23,7 @@ from vvgt_cli.volume.options import ReadOptions, crop, masked, parse_crop
 from vvgt_cli.volume.plain import RAW
 from vvgt_cli.volume.plain.raw import parse_name, read_stdin
 from vvgt_cli.volume.readers import HEAD_BYTES, READERS, SCHEMES, STEPPED, Reader, is_glob, register_plugins
-from vvgt_cli.volume.space import in_space, turned
+from vvgt_cli.volume.space import in_space, laid
 from vvgt_cli.volume.tiff import SLICES
 from vvgt_cli.volume.types import Volume
 
@@ -62,20 +62,21 @@ def cut(volume: Volume, options: ReadOptions) -> Volume:
     """Apply the options' crop, mask and largest body to a volume.
 
     Raises:
-        DataError: a mask of another size.
+        DataError: a mask of another size or place.
         UsageError: a crop outside of the volume.
     """
     box = None if options.crop is None else parse_crop(options.crop)
     how = ReadOptions(stored=options.stored)
     mask = read_volume(options.mask, how) if isinstance(options.mask, str) else options.mask
-    mask = mask if mask is None else turned(mask, volume)
+    turned = None if mask is None else laid(mask, volume)
+    placed, mask = turned is not None and options.spacing is None, turned or mask
     if mask is not None and box is not None and mask.dims == volume.dims:
         mask = crop(mask, box)
     volume = volume if box is None else crop(volume, box)
-    if mask is not None:
-        if options.spacing is not None:  # holds for both, whatever their files say
-            mask = replace(mask, spacing=volume.spacing, origin=volume.origin)
-        volume = masked(volume, mask, options.stored)
+    if mask is not None and placed and mask.dims == volume.dims:
+        why = "resample it onto that grid, or correct the place in its header"
+        mask.check_grid(f"--mask {mask.name}", volume, volume.name, why)
+    volume = volume if mask is None else masked(volume, mask, options.stored)
     if options.keep_largest is None:
         return volume
     return masked(volume, without_other_bodies(volume, options.keep_largest), options.stored)

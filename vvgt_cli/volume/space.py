@@ -17,7 +17,7 @@ import numpy as np
 from vvgt_cli.errors import UsageError
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.stored import Stored
-from vvgt_cli.volume.types import Volume, triple
+from vvgt_cli.volume.types import IDENTITY, Volume, triple
 
 SPACES = ("RAS", "LPS")
 _OPPOSITE = {"R": "L", "L": "R", "A": "P", "P": "A", "S": "I", "I": "S"}
@@ -72,20 +72,32 @@ def in_space(volume: Volume, wanted: str | None) -> Volume:
     return replace(volume, direction=direction, origin=origin, space=wanted)
 
 
-def turned(volume: Volume, to: Volume) -> Volume:
-    """Return a volume with its index axes in the order and directions of another's, if it has these axes in memory."""
-    volume = in_space(volume, to.space) if volume.space and to.space else volume
-    signs = np.rint(np.linalg.inv(volume.axes) @ to.axes)
+def laid(mask: Volume, volume: Volume) -> Volume | None:
+    """Return a mask with its index axes in the order and directions of a volume's, if it has these axes in memory.
+
+    Return None where one of both states no place, or not in the same space: then voxels are all that compares. A mask
+    whose voxels are one unit of a space, from its origin on, has lost its place, which a warning says.
+    """
+    mask = in_space(mask, volume.space) if mask.space and volume.space else mask
+    stated = [bool(v.space or any(v.origin) or v.direction != IDENTITY) for v in (mask, volume)]
+    if not all(stated) or mask.space != volume.space:
+        return None
+    if (np.abs(mask.affine) == np.eye(4)).all() and (np.abs(volume.affine) != np.eye(4)).any():
+        warnings.warn(f"--mask {mask.name}: states no place; applied voxel by voxel", stacklevel=3)
+        return None
+    if (own := metres(mask.unit)) and (other := metres(volume.unit)):
+        spacing, origin = (triple(v * own / other for v in lengths) for lengths in (mask.spacing, mask.origin))
+        mask = replace(mask, spacing=spacing, origin=origin, unit=volume.unit)
+    signs = np.rint(np.linalg.inv(mask.axes) @ volume.axes)
     across = np.abs(signs)
-    apart = (across.sum(0) != 1).any() or (across.sum(1) != 1).any() or not volume.compares(to)
-    if apart or isinstance(volume.data, Stored):
-        return volume
+    if (across.sum(0) != 1).any() or (across.sum(1) != 1).any() or isinstance(mask.data, Stored):
+        return mask
     flips = tuple(slice(None, None, -1 if sign < 0 else 1) for sign in signs.sum(0)[::-1])
-    data = volume.data.transpose([2 - k for k in across.argmax(0)[::-1]])[flips]
-    steps, lengths = volume.affine[:3, :3] @ signs, np.array(volume.spacing) @ across
-    first = volume.affine @ [*np.where(signs.sum(1) < 0, np.array(volume.dims) - 1, 0), 1]
-    direction = tuple((steps / lengths).ravel().tolist())
-    return replace(volume, data=data, spacing=triple(lengths), origin=tuple(first[:3].tolist()), direction=direction)
+    data = mask.data.transpose([2 - k for k in across.argmax(0)[::-1]])[flips]
+    lengths = np.array(mask.spacing) @ across
+    first = mask.affine @ [*np.where(signs.sum(1) < 0, np.array(mask.dims) - 1, 0), 1]
+    direction = tuple((mask.affine[:3, :3] @ signs / lengths).ravel().tolist())
+    return replace(mask, data=data, spacing=triple(lengths), origin=tuple(first[:3].tolist()), direction=direction)
 
 
 def metres(unit: str) -> float | None:

@@ -15,7 +15,7 @@ from vvgt_cli.volume.segments import Segment
 DENSITY = "density"  # `Volume.preset`
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 FLAT = 1e-3  # volume of the parallelepiped of three unit axes, below which they lie in a plane
-ALIKE = 1e-3  # of a voxel, by which places on one grid may differ
+ALIKE = 0.02  # of a voxel, by which places on one grid may differ
 RIGHT = 1e-4  # cosine up to which axes are at right angles
 
 
@@ -159,11 +159,6 @@ class Volume:
         matrix[:3, :3] = self.axes * np.array(self.spacing)
         matrix[:3, 3] = self.origin
         return matrix
-
-    def compares(self, other: Volume) -> bool:
-        """Tell whether this volume and another have places in one space; without origin and direction one has none."""
-        placed = (v.space or any(v.origin) or v.direction != IDENTITY for v in (self, other))
-        return self.space == other.space and all(placed)
 
     def check_grid(self, own: str, first: Volume, name: str, why: str) -> None:
         """Raise DataError unless this volume, called ``own``, has the grid of ``first``, called ``name``."""

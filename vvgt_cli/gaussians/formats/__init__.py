@@ -122,7 +122,7 @@ def is_splats(path: str | Path) -> bool:
     if format_of(path) or Path(path).name.lower().endswith(".ply") or split_name(path):
         return True
     try:
-        with open(_there(path), "rb") as stream:
+        with open(seekable(path), "rb") as stream:
             return stream.read(4) in (b"ply\n", b"ply\r")
     except OSError:
         return False

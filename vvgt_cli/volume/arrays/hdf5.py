@@ -217,7 +217,7 @@ def scaled_axes(dataset: Any, read: Callable[[Any], Any]) -> list[Axis]:
             axes.append(axis(dimension.label or (names[0] if names else ""), size))
             continue
         own = scales[0].name.rpartition("/")[2]
-        name = next((n for n in (dimension.label, *dimension.keys()) if axis(n, size).role), own)
+        name = next((n for n in (own, dimension.label, *dimension.keys()) if axis(n, size).role), own)
         if len(scales) > 1:
             others = ", ".join(printable(scale.name) for scale in scales[1:])
             warnings.warn(f"{printable(dataset.name)}: coordinates are those of {own}, not of {others}", stacklevel=3)

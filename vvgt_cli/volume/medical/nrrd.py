@@ -107,7 +107,7 @@ def _component_axis(fields: HeaderFields, sizes: list[int], vectors: list[list[f
     if not odd and len(kinds) == len(sizes):
         odd = [k for k, kind in enumerate(kinds) if kind not in _SPATIAL_KINDS]
     if not odd and len(sizes) == 4:
-        odd = [0 if sizes[0] <= sizes[3] else 3]
+        odd = [3 if _space_name(fields).endswith("-time") or sizes[0] > sizes[3] else 0]
     if len(sizes) - len(odd) not in (2, 3) or len(odd) > 1:
         raise DataError(
             f"{fields.name}: axes of sizes {sizes}, of which {len(odd)} are not spatial; expected two or three "
@@ -274,6 +274,7 @@ def _volume(path: Path, fields: HeaderFields, block: np.ndarray, sizes: list[int
     component, kinds = options.component, fields.get("kinds", "").lower()
     kind = dict(enumerate(kinds.split())).get(axis, "") if axis is not None else ""
     timed = _space_name(fields).endswith("-time") and kind in ("", "space", "domain")
+    timed = timed and "none" not in fields.get("spacedirections", "")
     if timed or kind == "time" or (kind == "list" and _SEQUENCE.search(path.name)):
         component = _step(block, options, str(path))
     elif options.time:

@@ -133,7 +133,8 @@ def read_tiff(path: Path, options: ReadOptions, slices: int = 1) -> Volume:
         warnings.warn(f"{path}: {'; '.join(doubts)} (--spacing X Y Z sets it)", stacklevel=2)
     if facts.scaling != (1.0, 0.0) and options.component == "magnitude":
         raise UsageError(f"{path}: calibrated values, of which no magnitude is taken; choose one channel")
-    origin = triple(0.0 - n * edge for n, edge in zip(facts.zero, volume.spacing, strict=True))
+    steps = (_positive(edge) or own for edge, own in zip(facts.spacing, volume.spacing, strict=True))
+    origin = triple(0.0 - n * step for n, step in zip(facts.zero, steps, strict=True))
     return replace(
         volume, unit=facts.length, slope=facts.scaling[0], intercept=facts.scaling[1], value_unit=facts.value_unit,
         origin=origin,
@@ -373,7 +374,9 @@ def imagej_facts(stated: dict[str, Any], resolution: tuple[float | None, float |
         scales = dict(zip(*(str(stated.get(key, "")).split(",") for key in ("axes", "scales")), strict=False))
         x, y, z = (_positive(scales.get(axis)) for axis in "XYZ")
         resolution, tag, stated = (x and 1 / x, y and 1 / y), 1, {"spacing": z, **stated}
-    zero = triple(_number(str(stated.get(f"{axis}origin", 0))) or 0.0 for axis in "xyz")
+    zero = triple(
+        float(np.nan_to_num(_number(str(stated.get(f"{axis}origin"))) or 0.0, posinf=0, neginf=0)) for axis in "xyz"
+    )
     channels, slices, frames = (int(stated.get(key, 1)) for key in ("channels", "slices", "frames"))
     images, assumed, name = channels * slices * frames, [], str(stated.get("unit", "")).strip()
     unit, per = _unit(name), _PER.get(tag, "")
