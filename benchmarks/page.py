@@ -173,7 +173,7 @@ def main(
         for one in function.split():
             tf = None if one == "-" else functions / one if (functions / one).exists() else one
             table = one.endswith("-labels.json")
-            distance = "mean-spacing" if one.endswith(".json") and not table else None
+            distance = "mean-spacing" if one.endswith(".json") else None  # what a crop does not change
             for kind in kinds:
                 number, light, rule = KINDS[kind]
                 if number and (begun.layers or tf is None or table):
