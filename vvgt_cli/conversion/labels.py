@@ -21,7 +21,7 @@ from vvgt_cli.conversion.index import LABELS
 from vvgt_cli.conversion.opened import open_field
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import DataError, NothingVisible
-from vvgt_cli.field.layered import OpenedFile, content_of, layers_of, open_content, told_apart
+from vvgt_cli.field.layered import OpenedFile, layers_of, told_apart
 from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians, concatenate
@@ -79,7 +79,7 @@ class Labels(Batch):
             names: list[str] = []
             for one in sources:
                 own = replace(request, source=one, fit=replace(request.fit, max_gaussians=budget))
-                content = _content(one, request.blocks is not None)
+                content = one.content(stored=request.blocks is not None)
                 firsts.append(content.volumes[0])
                 check_lengths(firsts[0], firsts[-1])
                 names.append(unused(content.volumes[0].name, names))
@@ -117,12 +117,6 @@ def check_lengths(first: Volume, other: Volume) -> None:
             f"{other.name}: its lengths are in {its or 'no stated unit'}, those of {first.name} in "
             f"{own or 'no stated unit'}; expected one unit: write files with places in mm, or convert them apart"
         )
-
-
-def _content(source: SourceRequest, stored: bool) -> OpenedFile:
-    """Return the content of the map's file, or the map itself."""
-    read = replace(source.read, stored=True, packed=True) if stored else source.read
-    return open_content(source.path, read) if isinstance(source.volume, str) else content_of(source.volume)
 
 
 def _parts(
