@@ -46,6 +46,14 @@ class Format:
     layout: Callable[[PlyOptions], PlyOptions] = lambda options: options
     write_nodes: Callable[[Sequence[Node], str], bytes] | None = None
 
+    def lacks(self, name: str) -> str | None:
+        """Return why a file of this name cannot be written: the library that is missing; None if it can."""
+        try:
+            self.needs(name)
+        except DataError as error:
+            return str(error)
+        return None
+
 
 def _one_of(write_nodes: Callable[[Sequence[Node], str], bytes]) -> Callable[[Splats, str], bytes]:
     """Return a writer of one cloud, as the root node, from a writer of nodes."""
