@@ -190,14 +190,16 @@ def volume_of(volume: VolumeLike, reading: Reading, name: str = "array") -> Volu
     from vvgt_cli.volume.registry import cut
 
     given: dict[str, Any] = dict(reading)
-    if isinstance(volume, str | os.PathLike):
-        return read_volume(os.fspath(volume), _options(given))
     affine, origin = given.pop("affine", None), given.pop("origin", None)
     options = _options(given)
     if isinstance(volume, Volume):
         if reading:
             raise UsageError(f"{', '.join(reading)}: the Volume is read already; remove {', '.join(reading)}")
         return volume
+    if isinstance(volume, str | os.PathLike):
+        if affine is not None or origin is not None:
+            raise UsageError("affine and origin are for arrays, and files have their own; remove them")
+        return read_volume(os.fspath(volume), options)
     whole = volume_in_memory(volume, options, origin=origin, affine=affine, name=name)
     return cut(whole, replace(options, stored=isinstance(whole.data, Stored)))
 
@@ -222,7 +224,7 @@ def _options(reading: Mapping[str, Any]) -> ReadOptions:
     given = dict(reading)
     if unknown := sorted(set(given) - set(Reading.__annotations__)):
         raise UsageError(f"{unknown[0]}: unknown option; expected one of {', '.join(Reading.__annotations__)}")
-    if given.pop("affine", None) is not None or given.pop("origin", None) is not None:
+    if "affine" in given or "origin" in given:
         raise UsageError("affine and origin are for arrays, and files have their own; remove them")
     for key in ("dims", "spacing"):
         if given.get(key) is not None:
