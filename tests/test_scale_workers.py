@@ -105,7 +105,7 @@ def test_a_damaged_part_is_a_line(vvgt, raw, tmp_path):
     vvgt.ok("init", raw, "-o", folder, *FIT, *SIZE, "--shard", "1/1")
     rows = sorted((folder / "cells").glob("*.rows"), key=lambda path: path.stat().st_size)[-1]
     rows.write_bytes(rows.read_bytes()[:-1000])
-    assert "truncated; remove" in vvgt.fails(1, "merge", folder, "-o", tmp_path / "a.ply")
+    assert "damaged (truncated); remove" in vvgt.fails(1, "merge", folder, "-o", tmp_path / "a.ply")
     rows.with_suffix(".npz").write_bytes(b"PK nonsense")
     assert "damaged" in vvgt.fails(1, "merge", folder, "-o", tmp_path / "a.ply")
     assert not (tmp_path / "a.ply").exists()

@@ -83,6 +83,3 @@ def run_case(case: Case) -> Outcome:
         return Outcome(case.stage, case.name, False, "", None, None, problem, seconds)
     value = figure.value if math.isfinite(figure.value) else None
     return Outcome(case.stage, case.name, not problem, figure.what, value, figure.limit, problem, seconds)
-
-
-__all__ = ["Case", "CheckError", "Figure", "Outcome", "require", "run_case"]

@@ -121,6 +121,3 @@ def backproject(
     if start.form is None:
         return solve_colors(start.gaussians, cameras, views, progress=progress, rule=rule), "colours"
     return fit_to_views(start.form, cameras, views, progress, rule)
-
-
-__all__ = ["METHODS", "Start", "VbmOptions", "backproject", "initialise"]

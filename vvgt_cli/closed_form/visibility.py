@@ -240,12 +240,8 @@ def march_views(
         if progress:
             progress(done / len(cameras))
     depth = sums[..., DEPTH].sum(axis=0)
-    unmet = np.float32(2 * scene.half.min() < THIN * max(_pixel(camera) for camera in cameras))
+    pixel = max(float(np.linalg.norm(camera.position)) / camera.fx for camera in cameras)  # its width at the centre
+    unmet = np.float32(2 * scene.half.min() < THIN * pixel)
     mean = np.divide(sums[..., SEEN].sum(axis=0), depth, out=np.full(depth.shape, unmet), where=depth > 0)
     largest = np.where(depth > 0, sums[..., LARGEST].max(axis=0), unmet)
     return Visibility(np.clip(mean, 0, 1), largest, voxels)
-
-
-def _pixel(camera: Camera) -> float:
-    """Return the width of a pixel at the centre, unit frame."""
-    return float(np.linalg.norm(camera.position)) / camera.fx

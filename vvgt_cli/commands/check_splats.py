@@ -21,7 +21,7 @@ from vvgt_cli.checks.splats import (
     row_cases,
     value_cases,
 )
-from vvgt_cli.commands.evaluation import opened_as_recorded, shown
+from vvgt_cli.commands.evaluation import opened_as_recorded, shown, together
 from vvgt_cli.conversion.gaussian_files import file_rule, open_gaussians
 from vvgt_cli.conversion.place import to_box_frame
 from vvgt_cli.errors import DataError
@@ -98,10 +98,8 @@ def _against(field: Field, unit: Gaussians, header: PlyHeader, size: int, tolera
     frame, gaussians = volume.unit_frame(), to_box_frame(unit, volume)
     world = to_box_frame(rescale(unit, frame.scale, -np.array(frame.centre), np.zeros(3)), volume)
     pictures = [Picture(camera, settings) for camera in orientation_cameras()]
-    field.views.expect(pictures)
-    seen = [field.views.view(*picture) for picture in pictures]
-    for picture in pictures:
-        field.views.forget(picture)
+    with together(field, pictures):
+        seen = [field.views.view(*picture) for picture in pictures]
     yield from place_cases(gaussians, world, np.array(frame.half), seen, rule.at(ORIENTATION_SIZE / size))
 
     @cache

@@ -28,7 +28,7 @@ from vvgt_cli.field.layered import open_content
 from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians, as_ply
-from vvgt_cli.gaussians.formats import ready
+from vvgt_cli.gaussians.formats import PAGE
 from vvgt_cli.look import LabelTable, Lighting
 from vvgt_cli.progress import Console, ProgressCallback
 from vvgt_cli.resources import set_memory
@@ -80,15 +80,15 @@ class LoadedVolume:
     def send_page(self, console: MessageConsole) -> None:
         """Send the page of the volume without Gaussians, or with a conversion if its look cannot be changed."""
         request = ConvertRequest(self.source)
+        why = PAGE.lacks("the page.html")
         with open_field(Run(console, ConversionReport("view")), request, ()) as field:
             values, self.lighting = field.source.values(), field.source.tf.lighting
-            if values is not None and values.look is not None and _missing() is None:
+            if values is not None and values.look is not None and why is None:
                 corners = field.source.volume.unit_frame().half
                 ply = as_ply(hidden(corners), ply_options(request, field.source))
                 console.send(Converted(ply, page_files(*cloud_of(ply), self.name, values), values))
                 return
-        why = _missing() or "its look cannot be changed: colours, or too many labels"
-        console.message(f"converted first: {why}")
+        console.message(f"converted first: {why or 'its look cannot be changed: colours, or too many labels'}")
         self._converted(request, console, self._with_page)
 
     def convert(self, job: Job, console: MessageConsole) -> None:
@@ -130,15 +130,6 @@ def hidden(half: Sequence[float]) -> Gaussians:
         ends.astype(np.float32), np.full((2, 3), -9, np.float32), turned, np.full(2, -20, np.float32),
         np.zeros((2, 3), np.float32),
     )  # fmt: skip
-
-
-def _missing() -> str | None:
-    """Return why pages with values cannot be written, None if they can."""
-    try:
-        ready("the page.html")
-    except DataError as error:
-        return str(error)
-    return None
 
 
 def _plain_file(conversion: Conversion) -> Converted:

@@ -133,7 +133,7 @@ def opened_as_recorded(
 
 
 @contextmanager
-def _together(field: Field, pictures: Sequence[Picture]) -> Iterator[None]:
+def together(field: Field, pictures: Sequence[Picture]) -> Iterator[None]:
     """Draw the pictures requested within the block together if the volume is in blocks; forget them afterwards."""
     field.views.expect(pictures)
     yield
@@ -233,7 +233,7 @@ def _scored(
     evaluation = Evaluation(len(carried), size, rule.name, step, views, record, function, own)
     settings = replace(REFERENCE, step=step)
     wanted = [Picture(camera, settings, part) for _, camera, part in scored_views(size)]
-    with run.stage("test views") as stage, _together(volume, wanted):
+    with run.stage("test views") as stage, together(volume, wanted):
         bar = run.console.bar("test views")
         scores = score_test_views(volume.views, gaussians, size, settings, rule=rule, progress=bar)
         evaluation.scores = asdict(scores)
@@ -257,13 +257,13 @@ def _look_around(
     size, settings = evaluation.size, RenderSettings()
     places = condition_pictures(viewing_conditions(size)) + more
     wanted = [Picture(camera, settings, blocks) for _, camera, blocks in places]
-    with run.stage("conditions") as stage, _together(volume, wanted):
+    with run.stage("conditions") as stage, together(volume, wanted):
         seen = condition_views(volume.views, places, settings, run.console.bar("conditions"))
         conditions = score_conditions(gaussians, seen, headset=rule.name)
         evaluation.conditions = [asdict(condition) for condition in conditions]
         stage.note = f"worst: {conditions[0].name()}, {conditions[0].psnr:.2f} dB"
     near = [Picture(camera, settings) for camera in near_cameras(size)]
-    with run.stage("texture") as stage, _together(volume, near):
+    with run.stage("texture") as stage, together(volume, near):
         scores = score_texture(volume.views, gaussians, size, rule, settings, progress=run.console.bar("texture"))
         evaluation.texture = asdict(scores)
         stage.note = texture_note(scores)
@@ -280,6 +280,6 @@ def _reference_psnr(volume: Field, size: int, step: float) -> float:
     middle = default_views("test", size=size)[0].middle(min(size // 2, MIDDLE))
     settings = replace(REFERENCE, step=step)
     finer = replace(settings, step=settings.step / 2, tiers=tuple((edge, 4 * rays) for edge, rays in settings.tiers))
-    with _together(volume, [Picture(middle, finer), Picture(middle, settings)]):
+    with together(volume, [Picture(middle, finer), Picture(middle, settings)]):
         images = [render_view(volume.views, middle, s) for s in (finer, settings)]
     return score_view(images[0], images[1], perceptual=False).psnr

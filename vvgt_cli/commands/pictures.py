@@ -24,7 +24,7 @@ from vvgt_cli.conversion.manifest import Shard
 from vvgt_cli.conversion.opened import opened_upright
 from vvgt_cli.conversion.recolored import MIP, NAMES, XRAY, Draw, draw_gaussians, grey, recolored
 from vvgt_cli.conversion.request import ConvertRequest
-from vvgt_cli.errors import DataError, SeveralSteps, UsageError, pip_install
+from vvgt_cli.errors import DataError, SeveralSteps, UsageError
 from vvgt_cli.field.blocked import Blocked
 from vvgt_cli.field.field import Field, Resident
 from vvgt_cli.field.grid import Boxes
@@ -46,6 +46,7 @@ from vvgt_cli.look.tables import Optics, exposed_distance
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import Run
 from vvgt_cli.volume import Statistics
+from vvgt_cli.volume.libraries import need
 from vvgt_cli.volume.readers import is_glob
 
 VIEWS_FILE, PICTURE = "transforms.json", ".png"
@@ -437,13 +438,7 @@ def _gif(path: Path, frames: Iterator[np.ndarray], rate: int) -> None:
 
 
 def _ffmpeg(source: str) -> Any:
-    try:
-        import imageio_ffmpeg
-    except ImportError as error:
-        raise DataError(
-            f"{source}: .mp4 needs imageio_ffmpeg ({error}); try: {pip_install('share')}, or .gif"
-        ) from None
-    return imageio_ffmpeg
+    return need("imageio_ffmpeg", "share", source, ".mp4, unlike .gif,")
 
 
 def _mp4(path: Path, frames: Iterator[np.ndarray], rate: int) -> None:

@@ -324,7 +324,7 @@ def save(
     for k in range(len(nodes[0].levels)):
         whole = concatenate([node.levels[k] for node in nodes]).arrays()
         arrays |= {f"{name}-{k}": array for name, array in whole.items()}
-    store.save(kind, number, ".npz", **(more | arrays))
+    store.save(kind, number, **(more | arrays))
 
 
 @dataclass(frozen=True)

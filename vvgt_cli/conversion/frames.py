@@ -28,7 +28,7 @@ from vvgt_cli.network.card import CARD, find_model
 from vvgt_cli.progress import Console, counted
 from vvgt_cli.score.record import Run
 from vvgt_cli.version import VERSION
-from vvgt_cli.volume import ReadOptions, Statistics, Volume, statistics
+from vvgt_cli.volume import ReadOptions, Statistics, Volume, edges_of, statistics
 from vvgt_cli.volume.label_maps import labels_in, recognised
 from vvgt_cli.volume.medical.masks import hold_volumes, mask_files
 from vvgt_cli.volume.readers import is_glob
@@ -269,11 +269,7 @@ def _check_frame(step: Step, begin: Step, content: OpenedFile, first: OpenedFile
 def merge_statistics(volumes: Sequence[Statistics]) -> Statistics:
     """Merge the statistics of several volumes; counts are spread evenly within the bins of each."""
     lo, hi = min(p.lo for p in volumes), max(p.hi for p in volumes)
-    widest = max(volumes, key=lambda p: p.edges[-1] - p.edges[0])
-    ends = (lo, hi) if lo < hi else (widest.edges[0], widest.edges[-1])
-    steps = np.arange(len(widest.edges)) / (len(widest.edges) - 1)
-    edges = ends[0] * (1 - steps) + ends[1] * steps
-    edges[0], edges[-1] = ends
+    edges = edges_of(lo, hi)
     below = np.zeros(len(edges))
     for one in volumes:
         below += np.interp(edges, one.edges, np.concatenate([[0], np.cumsum(one.histogram)]))

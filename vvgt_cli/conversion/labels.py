@@ -21,7 +21,7 @@ from vvgt_cli.conversion.index import LABELS
 from vvgt_cli.conversion.opened import open_field
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import DataError, NothingVisible
-from vvgt_cli.field.layered import IN_MEMORY, OpenedFile, content_of, is_plain, layers_of, open_content, told_apart
+from vvgt_cli.field.layered import OpenedFile, layers_of, told_apart
 from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians, concatenate
@@ -32,7 +32,7 @@ from vvgt_cli.look.tables import extinction
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.volume import Volume
-from vvgt_cli.volume.label_maps import extents_of
+from vvgt_cli.volume.label_maps import extents_of, recognised
 from vvgt_cli.volume.space import metres
 from vvgt_cli.volume.stored import planes, values_at
 
@@ -79,7 +79,7 @@ class Labels(Batch):
             names: list[str] = []
             for one in sources:
                 own = replace(request, source=one, fit=replace(request.fit, max_gaussians=budget))
-                content = _content(one, request.blocks is not None)
+                content = one.content(stored=request.blocks is not None)
                 firsts.append(content.volumes[0])
                 check_lengths(firsts[0], firsts[-1])
                 names.append(unused(content.volumes[0].name, names))
@@ -119,12 +119,6 @@ def check_lengths(first: Volume, other: Volume) -> None:
         )
 
 
-def _content(source: SourceRequest, stored: bool) -> OpenedFile:
-    """Return the content of the map's file, or the map itself."""
-    read = replace(source.read, stored=True, packed=True) if stored else source.read
-    return open_content(source.path, read) if isinstance(source.volume, str) else content_of(source.volume)
-
-
 def _parts(
     request: ConvertRequest, content: OpenedFile, layer: str, tables: list[str], used: set[tuple[float, float, float]]
 ) -> list[Part]:  # fmt: skip
@@ -135,7 +129,8 @@ def _parts(
     """
     source = request.source
     labels = source.labels or (None if layer else AUTO)
-    if not content.overlapping and (not content.single_volume or is_plain(content, source.tf, labels, (), IN_MEMORY)):
+    scalars = labels == NO_LABELS or (labels is None and (source.tf is not None or not recognised(content.volumes[0])))
+    if not content.overlapping and (scalars or not content.single_volume):
         name = layer or content.volumes[0].name
         whole = replace(source, volume=content) if request.blocks is None else source
         return [(Item(name, UNSAFE.sub("-", name), replace(request, source=whole)), None)]

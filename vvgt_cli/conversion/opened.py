@@ -13,7 +13,7 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.blocked import Blocked
 from vvgt_cli.field.field import Field
-from vvgt_cli.field.layered import content_of, open_content
+from vvgt_cli.field.layered import content_of
 from vvgt_cli.field.open import MIN_BLOCKED, FieldNeeds, automatic, opened, store_beside
 from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.field.source import SourceRequest, StyledVolume, tf_record, volume_record
@@ -100,8 +100,7 @@ def read_once(
     if blocks is not None or len(sources) == 1:
         return list(sources), blocks
     with run.stage("volume") as stage:
-        given = first.volume
-        content = open_content(first.path, first.read) if isinstance(given, str) else content_of(given)
+        content = first.content()
         content.prepare()
         stage.note = f"{content.volumes[0].name}, for {len(sources)} functions"
     return [replace(source, volume=content) for source in sources], None

@@ -99,7 +99,7 @@ class PartTask:
             save(self.cut.store, self.kind, number, nodes, errors)
             return
         faint = [sum(int((node.levels[0].opacity_logits < FAINT_LOGIT).sum()) for node in nodes)]
-        self.cut.store.save(self.kind, number, ".npz", faint=np.array(faint), **errors)
+        self.cut.store.save(self.kind, number, faint=np.array(faint), **errors)
 
     def _refined(self, nodes: list[TileGaussians], number: int, refiner: Refiner) -> list[TileGaussians]:
         """Return the nodes of a part, each level refined as a whole."""

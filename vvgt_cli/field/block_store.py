@@ -98,33 +98,30 @@ class BlockStore:
         """Return those of ``numbers`` that have no result yet."""
         return [number for number in numbers if not self.path(kind, number).is_file()]
 
-    def save(self, kind: str, number: int, suffix: str = ".npz", **arrays: np.ndarray) -> None:
-        """Write a result atomically; the one with the default suffix comes last and marks the block as done.
+    def save(self, kind: str, number: int, **arrays: np.ndarray) -> None:
+        """Write a result atomically, after the files beside it: it marks the block as done.
 
         Raises:
             DataError: the file cannot be written (a full disk).
         """
-        write_arrays(self.path(kind, number, suffix), arrays)
+        write_arrays(self.path(kind, number), arrays)
 
-    def load(
-        self, kind: str, number: int, suffix: str = ".npz", names: Collection[str] | None = None
-    ) -> dict[str, np.ndarray]:
+    def load(self, kind: str, number: int, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
         """Return the arrays of a result, by default all; raise DataError if the file is missing or damaged."""
-        with self._opened(kind, number, suffix) as arrays:
+        with self.reading(kind, number) as path, np.load(path) as arrays:
             return {name: arrays[name] for name in (arrays.files if names is None else names)}
 
-    def names(self, kind: str, number: int, suffix: str = ".npz") -> frozenset[str]:
+    def names(self, kind: str, number: int) -> frozenset[str]:
         """Return the names of a result's arrays; raise DataError if the file is missing or damaged."""
-        with self._opened(kind, number, suffix) as arrays:
+        with self.reading(kind, number) as path, np.load(path) as arrays:
             return frozenset(arrays.files)
 
     @contextmanager
-    def _opened(self, kind: str, number: int, suffix: str) -> Iterator[Any]:
-        """Open a result; zipfile, zlib and numpy raise many types, here and while it is read."""
+    def reading(self, kind: str, number: int, suffix: str = ".npz") -> Iterator[Path]:
+        """Yield the path of a file; what the block raises, of many types by zipfile, zlib and numpy, is a DataError."""
         path = self.path(kind, number, suffix)
         try:
-            with np.load(path) as arrays:
-                yield arrays
+            yield path
         except FileNotFoundError as error:
             text = f"{path}: block {number} is missing; remove its other files and run its shard again"
             raise DataError(text) from error

@@ -185,15 +185,6 @@ def open_content(source: str, read: ReadOptions) -> OpenedFile:
     return OpenedFile((volume,), path=source, stored=read.stored)
 
 
-def is_plain(
-    opened: OpenedFile, tf: object, labels: str | LabelTable | None, layers: Sequence[object], access: Access
-) -> bool:
-    """Return whether the content is one scalar field under a function, and not a recognised label map."""
-    if not opened.single_volume or layers or labels not in (None, NO_LABELS):
-        return False
-    return tf is not None or labels == NO_LABELS or not recognised(opened.volumes[0], access.labels)
-
-
 def layers_of(
     opened: OpenedFile,
     tf: str | TransferFunction | None,

@@ -19,7 +19,7 @@ from vvgt_cli.field.counting import BlockAccess
 from vvgt_cli.field.digests import digest
 from vvgt_cli.field.field import Field, Resident
 from vvgt_cli.field.grid import TILE_VOXELS
-from vvgt_cli.field.layered import OpenedFile, content_of, open_content
+from vvgt_cli.field.layered import OpenedFile, content_of
 from vvgt_cli.field.runners import Processes, Runner
 from vvgt_cli.field.settings import BlockOptions, block_bytes, block_edge, worker_count
 from vvgt_cli.field.source import SourceRequest, StyledVolume, describe_source, load
@@ -189,14 +189,10 @@ def opened(
 
 def _measured(request: SourceRequest) -> tuple[Volume, int | None]:
     """Return the volume, its values still in the file, and bytes per voxel where they are not those of its type."""
-    given, layered = request.volume, request.labels not in (None, NO_LABELS) or bool(request.layers)
-    if isinstance(given, str):
-        read = replace(request.read, stored=True, packed=True)
-        content = open_content(given, read)
-        volume, layered = content.volumes[0], layered or not content.single_volume
-        layered |= request.tf is None and named_so(volume)
-    else:
-        volume = content_of(given).volumes[0]
+    content, layered = request.content(stored=True), request.labels not in (None, NO_LABELS) or bool(request.layers)
+    volume = content.volumes[0]
+    if isinstance(request.volume, str):
+        layered |= not content.single_volume or (request.tf is None and named_so(volume))
     return volume, LAYERED_BYTES if layered else None
 
 
@@ -226,7 +222,7 @@ def _with_body(request: SourceRequest, store: BlockStore) -> SourceRequest:
     read, path = request.read, store.folder / "body.npy"
     if read.keep_largest is None or not isinstance(request.volume, str):
         return request
-    volumes = open_content(request.volume, replace(read, stored=True, packed=True)).volumes
+    volumes = request.content(stored=True).volumes
     if len(volumes) > 1:
         return request
     if not path.is_file():
@@ -304,8 +300,7 @@ def automatic(request: SourceRequest, console: Console) -> BlockOptions | None:
     Raises:
         DataError, UsageError: see `read_volume`.
     """
-    given = request.volume
-    if not isinstance(given, str) and any(isinstance(one.data, Stored) for one in content_of(given).volumes):
+    if not isinstance(request.volume, str) and any(isinstance(one.data, Stored) for one in request.content().volumes):
         console.message("a Dask array: processed in blocks (docs/scale.md)")
         return BlockOptions()
     if not better_in_blocks(request):
@@ -337,7 +332,7 @@ def better_in_blocks(request: SourceRequest) -> bool:
     if not packed and size < MIN_BLOCKED and (free is None or size <= LARGE * free):
         return False
     try:
-        content = open_content(path, replace(request.read, stored=True, packed=True))
+        content = request.content(stored=True)
     except SeveralComponents:  # reported when it is read
         return False
     volumes = content.volumes

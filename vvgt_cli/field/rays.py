@@ -7,7 +7,6 @@ composited front to back, so the result is the same to the byte whatever the blo
 from __future__ import annotations
 
 import itertools
-import os
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -221,13 +220,15 @@ def composed(
     shown: list[dict[int, tuple[int, slice]]] = [{} for _ in bundles]
     mapped: dict[int, np.ndarray] = {}
     for number in numbers:
-        path = store.path(kind, number, SUFFIX)
         offset = 0
         for piece, k, count in store.load(kind, number)["table"].tolist():
             shown[k][piece] = number, slice(offset, offset + count)
             offset += count
         if offset:
-            mapped[number] = _mapped(path, offset)
+            with store.reading(kind, number, SUFFIX) as path:
+                mapped[number] = np.load(path, mmap_mode="r")
+                if mapped[number].dtype != RAY or len(mapped[number]) != offset:
+                    raise ValueError(f"{len(mapped[number])} rays for {offset}")
     for bundle, parts in zip(bundles, shown, strict=True):
         each = len(bundle.offsets)
         color, through = np.zeros((len(bundle.pixels) * each, 3)), np.ones(len(bundle.pixels) * each)
@@ -239,18 +240,6 @@ def composed(
         for number in {number for number, _ in parts.values()}:
             give_back(mapped[number])
         yield np.concatenate([color, 1 - through[:, None]], axis=1).reshape(-1, each, 4)
-
-
-def _mapped(path: os.PathLike[str], count: int) -> np.ndarray:
-    """Return the rays of a result, memory-mapped."""
-    try:
-        rays: np.ndarray = np.load(path, mmap_mode="r")
-        if rays.dtype == RAY and len(rays) == count:
-            return rays
-        error: object = f"{len(rays)} rays for {count}"
-    except (OSError, ValueError, EOFError) as problem:
-        error = problem
-    raise DataError(f"{path}: damaged ({error}); remove the block's files and run the same command again")
 
 
 def front_to_back(pieces: Boxes, eye: np.ndarray, numbers: Sequence[int]) -> list[int]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import logging
 import os
 import shutil
@@ -17,10 +16,11 @@ from multiprocessing import get_context
 from threading import Thread
 from typing import TYPE_CHECKING, Any, Protocol, Self
 
-from vvgt_cli.errors import DataError, UsageError, pip_install
+from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import discard_leftovers
 from vvgt_cli.progress import ProgressCallback, counted
 from vvgt_cli.resources import memory_limit
+from vvgt_cli.volume.libraries import need
 
 if TYPE_CHECKING:
     from concurrent.futures import ProcessPoolExecutor
@@ -150,10 +150,7 @@ WAIT = "15s"  # for a scheduler to answer
 
 def _need(name: str) -> Any:
     """Import a package of the extra `cluster`; raise DataError if it is not installed."""
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        raise DataError(f"--scheduler: {name} is not installed; try: {pip_install('cluster')}") from None
+    return need(name, "cluster", "--scheduler", "Dask")
 
 
 class DaskRunner(Runner):

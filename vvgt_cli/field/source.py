@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from vvgt_cli.dvr.layers import Layer, common_grid, grid_of, smooth_labels
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError
 from vvgt_cli.field.digests import digest, volume_digest
-from vvgt_cli.field.layered import Access, OpenedFile, content_of, layers_of, told_apart
+from vvgt_cli.field.layered import Access, OpenedFile, content_of, layers_of, open_content, told_apart
 from vvgt_cli.jit.ahead import for_grid, for_light
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.histogram import UNIT_SHARE
@@ -60,8 +60,14 @@ class SourceRequest:
     def path(self) -> str:
         """Path of the volume's file; raises UsageError if the volume is already in memory."""
         if not isinstance(self.volume, str):
-            raise UsageError(f"{content_of(self.volume).volumes[0].name}: a volume in memory; expected a path here")
+            raise UsageError(f"{self.content().volumes[0].name}: a volume in memory; expected a path here")
         return self.volume
+
+    def content(self, *, stored: bool = False) -> OpenedFile:
+        """Return the content of the volume's file, with values still in it if ``stored``, or the volume itself."""
+        if not isinstance(self.volume, str):
+            return content_of(self.volume)
+        return open_content(self.volume, replace(self.read, stored=True, packed=True) if stored else self.read)
 
     def paths(self) -> list[str]:
         """Return the paths of all files that will be read."""

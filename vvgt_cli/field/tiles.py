@@ -23,7 +23,6 @@ from vvgt_cli.closed_form.tree import Leaves, Scores, Tree, leaves_of, split_sco
 from vvgt_cli.closed_form.visibility import Visibility, march_views
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.dvr.render import BoxFrame
-from vvgt_cli.errors import DataError
 from vvgt_cli.field.block_store import CELLS, COARSE, ROW, TREES, BlockStore
 from vvgt_cli.field.cells import NORMALS
 from vvgt_cli.field.grid import CellGrid
@@ -57,24 +56,18 @@ def places_of(store: BlockStore, grid: CellGrid) -> list[Place]:
 
 def read_cells(store: BlockStore, grid: CellGrid, place: Place, lit: bool) -> Cells:
     """Return the cells of a tile, with normals if they are ``lit``; raise DataError if a file is damaged."""
-    path, end = store.path(CELLS, place.block, ".rows"), place.offset + place.cells
-    try:
-        with open(path, "rb") as stream:
-            stream.seek(place.offset * ROW)
-            read = stream.readinto(content := bytearray(place.cells * ROW))  # writable, as kernels are compiled for
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror or error})") from error
-    if read < place.cells * ROW:
-        raise DataError(f"{path}: truncated; remove {path.with_suffix('.npz')} and run the same command again")
+    with store.reading(CELLS, place.block, ".rows") as path, open(path, "rb") as stream:
+        stream.seek(place.offset * ROW)
+        read = stream.readinto(content := bytearray(place.cells * ROW))  # writable, as kernels are compiled for
+        if read < place.cells * ROW:
+            raise EOFError("truncated")
     moments = np.frombuffer(content, np.float64, place.cells * MOMENTS).reshape(place.cells, MOMENTS)
     local = np.frombuffer(content, np.uint8, offset=moments.nbytes).reshape(place.cells, 3).astype(np.int32)
     index = local + np.array(place[:3], np.int32) * grid.tile_cells
-    path, normals = store.path(CELLS, place.block, NORMALS), None
+    normals = None
     if lit:
-        try:
-            normals = np.load(path, mmap_mode="r")[place.offset : end]
-        except (OSError, ValueError) as error:
-            raise DataError(f"{path}: damaged ({error}); remove it and its .npz and run the command again") from error
+        with store.reading(CELLS, place.block, NORMALS) as path:
+            normals = np.load(path, mmap_mode="r")[place.offset : place.offset + place.cells]
     return Cells(index, moments, grid.cell_edge, np.array(grid.exponent, np.int64), normals)
 
 
@@ -224,11 +217,9 @@ class TiledPyramid(Pyramid):
     def _scores(self, row: int) -> Scores:
         """Return the scores of a tile's cells, at most those of the cells above; raise DataError for a damaged file."""
         size, base, offset = self._saved[1][row]
-        path, top = self.store.path(TREES, self._saved[0][row].block, SCORES), self._top_scores
-        try:
+        top = self._top_scores
+        with self.store.reading(TREES, self._saved[0][row].block, SCORES) as path:
             above, capped = np.fromfile(path, np.float64, 2 * size, offset=offset).reshape(2, size)
-        except (OSError, ValueError) as error:
-            raise DataError(f"{path}: damaged ({error}); remove it and its .npz and run the command again") from error
         above, capped = np.minimum(above, top.capped[row]), np.minimum(capped, top.capped[row])
         above[-1] = top.above[row]
         return Scores(above, capped, np.arange(size) >= base)

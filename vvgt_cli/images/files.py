@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import struct
 import zlib
@@ -240,18 +241,10 @@ def read_png(path: str | PathLike[str]) -> np.ndarray:
     source = oiio.ImageInput.open(str(path), config)
     if source is None:
         raise DataError(f"{path}: not an image ({oiio.geterror().splitlines()[0]}); expected a PNG")
-    try:
-        spec, kind = source.spec(), source.format_name()
-        if kind != "png":
-            raise DataError(f"{path}: an image of format {kind}; expected a PNG")
-        check_pixels(path, spec.width, spec.height)
-        pixels = source.read_image(oiio.FLOAT)
-        if pixels is None:
-            raise DataError(f"{path}: damaged PNG ({' '.join(source.geterror().split())}); expected a complete one")
-    finally:
-        source.close()
-    pixels = np.asarray(pixels, dtype=np.float32).reshape(spec.height, spec.width, spec.nchannels)
-    if spec.nchannels <= 2:
+    if (kind := source.format_name()) != "png":
+        raise DataError(f"{path}: an image of format {kind}; expected a PNG")
+    pixels = _pixels(source, path, "PNG")
+    if pixels.shape[-1] <= 2:
         pixels = np.concatenate([np.repeat(pixels[..., :1], 3, axis=-1), pixels[..., 1:]], axis=-1)
     if pixels.shape[-1] == 4:
         pixels[..., :3] *= pixels[..., 3:]
@@ -281,14 +274,18 @@ def read_radiance(path: str | PathLike[str]) -> np.ndarray:
     if source is None:
         reason = oiio.geterror().splitlines() or ["no such file"]
         raise DataError(f"{path}: cannot be read ({reason[0]}); expected a picture of light, .hdr or .exr")
-    try:
+    pixels = _pixels(source, path, "picture", RADIANCE_BYTES)
+    return pixels[..., :3] if pixels.shape[-1] >= 3 else np.repeat(pixels[..., :1], 3, axis=-1)
+
+
+def _pixels(source: Any, path: str | PathLike[str], what: str, each: int = 0) -> np.ndarray:
+    """Return the pixels (h, w, c) float32 of an open image, for which memory must have ``each`` bytes, and close it."""
+    with contextlib.closing(source):
         spec = source.spec()
         check_pixels(path, spec.width, spec.height)
-        check_memory(RADIANCE_BYTES * spec.width * spec.height, str(path), "try a smaller picture")
-        pixels = source.read_image(oiio.FLOAT)
+        check_memory(each * spec.width * spec.height, str(path), "try a smaller picture")
+        pixels = source.read_image("float")
         if pixels is None:
-            raise DataError(f"{path}: damaged ({' '.join(source.geterror().split())}); expected a complete picture")
-    finally:
-        source.close()
-    pixels = np.asarray(pixels, np.float32).reshape(spec.height, spec.width, spec.nchannels)
-    return pixels[..., :3] if spec.nchannels >= 3 else np.repeat(pixels[..., :1], 3, axis=-1)
+            why = " ".join(source.geterror().split())
+            raise DataError(f"{path}: damaged {what} ({why}); expected a complete one")
+    return np.asarray(pixels, np.float32).reshape(spec.height, spec.width, spec.nchannels)

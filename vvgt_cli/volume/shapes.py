@@ -189,18 +189,14 @@ def volume_of(values: np.ndarray, name: str) -> Volume:
     return Volume(np.ascontiguousarray(values, np.float32), (h, h, h), origin, name=name)
 
 
-def marschner_lobb(size: Size = 64, frequency: float = 6.0, alpha: float = 0.25) -> Volume:
-    """Return the Marschner-Lobb test signal, values in [0, 1].
+def marschner_lobb(size: Size = 64) -> Volume:
+    """Return the Marschner-Lobb test signal, values in [0, 1]; the paper samples 40 voxels along each axis.
 
     Marschner and Lobb, "An evaluation of reconstruction filters for volume rendering", 1994, equation 1:
     ``(1 - sin(pi z / 2) + alpha (1 + cos(2 pi f cos(pi r / 2)))) / (2 (1 + alpha))`` with r in the x-y plane.
-
-    Args:
-        size: voxels (the paper samples 40 along each axis).
-        frequency: f; the highest local frequency is about pi f / 2 cycles per unit length.
-        alpha: weight of the ripples.
     """
     x, y, z = _axes(size)
+    frequency, alpha = 6.0, 0.25  # f: locally up to about pi f / 2 cycles per unit length; weight of the ripples
     ripples = np.cos(2 * np.pi * frequency * np.cos(np.pi * np.sqrt(x * x + y * y) / 2))
     return volume_of((1 - np.sin(np.pi * z / 2) + alpha * (1 + ripples)) / (2 * (1 + alpha)), "marschner-lobb")
 
@@ -221,20 +217,19 @@ def slab(size: Size = 64, thickness: float = 1.0, value: float = 1.0) -> Volume:
     return volume_of(np.broadcast_to(inside * value, (nz, ny, nx)), "slab")
 
 
-def sphere(size: Size = 64, radius: float = 0.7, value: float = 1.0, *, hard: bool = False) -> Volume:
-    """Return a ball of ``value`` around the centre, 0 outside.
+def sphere(size: Size = 64, radius: float = 0.7, *, hard: bool = False) -> Volume:
+    """Return a ball of 1 around the centre, 0 outside.
 
     Args:
         size: voxels.
         radius: radius in world units.
-        value: value inside.
         hard: binary values instead of a linear ramp of one voxel across the surface (close to the covered share).
     """
     x, y, z = _axes(size)
     h = 2.0 / max(_dims(size))
     distance = radius - np.sqrt(x * x + y * y + z * z)
     inside = distance >= 0 if hard else np.clip(distance / h + 0.5, 0, 1)
-    return volume_of(inside * value, "sphere")
+    return volume_of(inside, "sphere")
 
 
 def checkerboard(size: Size = 32, cells: int = 8) -> Volume:

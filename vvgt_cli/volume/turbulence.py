@@ -54,9 +54,9 @@ class Flow:
         check_memory(self.size**3 * BYTES, f"a flow of {self.size} x {self.size} x {self.size} points")
 
 
-def resolved_viscosity(size: int, power: float = POWER) -> float:
+def resolved_viscosity(size: int) -> float:
     """Return the nu that just resolves the smallest eddies: kmax eta = `RESOLVED`, eta = (nu^3 / P)^(1/4)."""
-    return float((RESOLVED * 3 / size) ** (4 / 3) * power ** (1 / 3))
+    return float((RESOLVED * 3 / size) ** (4 / 3) * POWER ** (1 / 3))
 
 
 class Solver:

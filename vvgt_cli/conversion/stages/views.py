@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from vvgt_cli.cameras import SET_VIEWS, Blocks, Camera, default_views, pixel_width, spread_blocks
+from vvgt_cli.cameras import SET_VIEWS, Blocks, Camera, default_views, picked, pixel_width, spread_blocks
 from vvgt_cli.conversion.request import FitOptions
 from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.field.field import Picture
@@ -166,15 +166,12 @@ def ray_settings(
 
     camera, blocks = _probe(size)
 
-    def picked(image: np.ndarray) -> np.ndarray:
-        return (image if blocks is None else blocks.pick(image))[..., :3]
-
     many, longer, shorter = _candidates(footprint)
-    fine = picked(render_view(scene, camera, many, blocks))
-    wanted = psnr(fine, picked(render(start, camera, rule, blocks=blocks)))
+    fine = picked(render_view(scene, camera, many, blocks)[..., :3], blocks)
+    wanted = psnr(fine, picked(render(start, camera, rule, blocks=blocks)[..., :3], blocks))
     wanted += MARGIN if footprint == 1 else SAMPLES
     for single, more in ((longer, LONGER), (shorter, 0.0)):
-        if psnr(fine, picked(render_view(scene, camera, single, blocks))) >= wanted + more:
+        if psnr(fine, picked(render_view(scene, camera, single, blocks)[..., :3], blocks)) >= wanted + more:
             return single
     return many
 

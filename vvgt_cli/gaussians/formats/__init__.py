@@ -46,6 +46,14 @@ class Format:
     layout: Callable[[PlyOptions], PlyOptions] = lambda options: options
     write_nodes: Callable[[Sequence[Node], str], bytes] | None = None
 
+    def lacks(self, name: str) -> str | None:
+        """Return why a file of this name cannot be written: the library that is missing; None if it can."""
+        try:
+            self.needs(name)
+        except DataError as error:
+            return str(error)
+        return None
+
 
 def _one_of(write_nodes: Callable[[Sequence[Node], str], bytes]) -> Callable[[Splats, str], bytes]:
     """Return a writer of one cloud, as the root node, from a writer of nodes."""
@@ -58,8 +66,8 @@ FORMATS = (  # the first whose ending fits is taken: a longer ending stands befo
     Format(".spz", gsply_files.spz, gsply_files.read_spz, gsply_files.gsply),
     Format(".sog", sog.sog, sog.read_sog, lambda name: None),
     Format(".glb", _one_of(gltf.glb), gltf.read_glb, lambda name: None, write_nodes=gltf.glb),
-    Format(".usdc", _one_of(usd.usdc), usd.read_usdc, usd.library, write_nodes=usd.usdc),
-    Format(".usdz", _one_of(usd.usdz), usd.read_usdz, usd.library, write_nodes=usd.usdz),
+    Format(".usdc", _one_of(usd.usdc), usd.read_usd, usd.library, write_nodes=usd.usdc),
+    Format(".usdz", _one_of(usd.usdz), usd.read_usd, usd.library, write_nodes=usd.usdz),
     Format(".html", page_look.html, page_file.read_html, gsply_files.gsply, page_file.upright),
 )
 PAGE = FORMATS[-1]

@@ -148,13 +148,13 @@ def _plain(array: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(array, np.float32)
 
 
-def read_usdc(content: bytes, name: str, ending: str = ".usdc") -> Splats:
-    """Read the columns of a `.usdc` as `usdc` writes, all prims together, or raise DataError."""
+def read_usd(content: bytes, name: str) -> Splats:
+    """Read the columns of a `.usdc` or `.usdz` as `usdc` writes, all prims together, or raise DataError."""
     usd = library(name)
     from pxr import UsdGeom
 
     with library_errors(name, f"a {KIND}"), tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"in{ending}"
+        path = Path(folder) / ("in.usdz" if content.startswith(b"PK") else "in.usdc")
         path.write_bytes(content)
         stage = usd.Stage.Open(str(path))
         comments = tuple(str(stage.GetRootLayer().customLayerData.get(_COMMENTS, "")).splitlines())
@@ -164,11 +164,6 @@ def read_usdc(content: bytes, name: str, ending: str = ".usdc") -> Splats:
         invisible = [prim for prim in prims if UsdGeom.Imageable(prim).ComputeVisibility() == UsdGeom.Tokens.invisible]
         report_off(name, [prim.GetDisplayName() or prim.GetName() for prim in invisible])
         return joined([_columns(prim, comments, name) for prim in prims])
-
-
-def read_usdz(content: bytes, name: str) -> Splats:
-    """Read the columns of a `.usdz`: see `read_usdc`."""
-    return read_usdc(content, name, ".usdz")
 
 
 def _columns(prim: Any, comments: tuple[str, ...], name: str) -> Splats:

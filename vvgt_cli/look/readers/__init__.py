@@ -17,7 +17,6 @@ from vvgt_cli.look.readers.fields import load
 FORMATS = (paraview, minimal, slicer, inviwo, lut)
 OWN = (".itf", ".vp", *lut.SUFFIXES)  # endings that nothing else has
 SUFFIXES = (".json", ".xml", *OWN)
-__all__ = ["read_transfer_function"]
 
 
 def read_transfer_function(source: str | os.PathLike[str] | Mapping[str, Any]) -> TransferFunction:

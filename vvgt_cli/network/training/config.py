@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from vvgt_cli.closed_form import METHODS
-from vvgt_cli.errors import DataError, UsageError, pip_install
+from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.network import NAMED, NetworkConfig
 
 SMALLEST_LPIPS = 16  # pixels: VGG-16 pools four times
@@ -190,10 +190,11 @@ def read_config(path: str | Path) -> TrainConfig:
     """Read a configuration from YAML; missing fields have their defaults.
 
     Raises:
-        UsageError: no such file, or PyYAML is missing.
+        UsageError: no such file.
         DataError: not YAML, or not a configuration.
     """
-    yaml = _yaml()
+    import yaml
+
     if not Path(path).is_file():
         raise UsageError(f"{path}: no such file; expected a training configuration (YAML)")
     try:
@@ -210,13 +211,7 @@ def read_config(path: str | Path) -> TrainConfig:
 
 def config_text(config: TrainConfig) -> str:
     """Return the YAML that `read_config` reads."""
+    import yaml
+
     plain = json.loads(json.dumps(asdict(config)))  # YAML's safe form has no tuples
-    return str(_yaml().safe_dump(plain, sort_keys=False))
-
-
-def _yaml() -> Any:
-    try:
-        import yaml
-    except ImportError:
-        raise UsageError(f"training configurations need PyYAML; try: {pip_install('train')}") from None
-    return yaml
+    return str(yaml.safe_dump(plain, sort_keys=False))

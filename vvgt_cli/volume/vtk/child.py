@@ -25,6 +25,7 @@ from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, Several
 from vvgt_cli.resources import free_memory
 from vvgt_cli.volume.arrays.grib import GRIB, grib_volume
 from vvgt_cli.volume.blocks import fill
+from vvgt_cli.volume.libraries import library_errors
 from vvgt_cli.volume.readers import HDF5, HEAD_BYTES, volume_name
 from vvgt_cli.volume.reading import ArrayInfo, ReadOptions, Volume, check_memory, count
 from vvgt_cli.volume.vtk import GRIDS, IMAGE, INDEX, INDEXES, SINGLE, is_index, xml_kind
@@ -190,19 +191,14 @@ def answer(request: dict[str, Any]) -> tuple[dict[str, Any], np.ndarray | None]:
     options = ReadOptions(**given)
     caught: list[Any] = []
     try:
-        with warnings.catch_warnings(record=True) as caught:
+        kind = "GRIB" if request["program"] == GRIB else "a file for VTK"
+        with library_errors(str(path), kind), warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             facts, values = _work(request["program"], path, options, request["task"])
-    except (*ERRORS, UsageError) as error:
+    except VvgtError as error:
         facts, values = {"error": type(error).__name__, "text": str(error), "state": vars(error)}, None
         if isinstance(error, SeveralArrays) and request["program"] not in (GRIB, IMAGE):  # others list them
             facts |= {"error": "UsageError", "state": {}}
-    except Exception as error:  # of readers that were given anything
-        text = " ".join(str(error).split())[:300] or type(error).__name__
-        text = f"{path}: damaged ({text}); check that it is whole"
-        if isinstance(error, MemoryError):
-            text = f"{path}: not enough memory to read it; try a machine with more"
-        facts, values = {"error": "DataError", "text": str(error) if isinstance(error, VvgtError) else text}, None
     again = facts.get("error") in [kind.__name__ for kind in ERRORS]  # the question repeats them
     notes = [str(one.message) for one in caught if one.category is UserWarning and not again]
     return {**facts, "notes": notes}, values
