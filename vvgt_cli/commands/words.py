@@ -156,10 +156,8 @@ class SectionedCommand(click.Command):
             left = super().parse_args(ctx, args)
             for param in self.params:
                 value = None if param.name == "array" or ctx.resilient_parsing else ctx.params.get(param.name)
-                if value == "" or (isinstance(value, tuple) and "" in value):
-                    raise click.BadParameter(
-                        "'' is empty; expected a value (is a variable of the shell unset?)", ctx, param
-                    )
+                if "" in (value if isinstance(value, tuple) else (value,)):
+                    raise click.BadParameter("'' is empty; expected a value (is a variable unset?)", ctx, param)
             return left
         except click.UsageError as error:
             files = [word for word in given if os.path.exists(word)]

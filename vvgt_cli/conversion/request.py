@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -66,12 +67,9 @@ class FitOptions:
         for name in ("max_gaussians", "screen", "steps", "seed"):
             given = getattr(self, name)
             if given is not None or name != "steps":
-                try:
+                with suppress(TypeError, ValueError, OverflowError):  # of text, lists, NaN and infinity
                     object.__setattr__(self, name, int(given))
-                    whole = bool(getattr(self, name) == given)
-                except (TypeError, ValueError, OverflowError):  # NaN and infinity too
-                    whole = False
-                if not whole:
+                if not isinstance(now := getattr(self, name), int) or now != given:
                     raise UsageError(f"{name} {given!r}: expected a whole number")
         if self.target_psnr is not None and not 0 <= self.target_psnr <= 150:
             raise UsageError(f"--target-psnr {self.target_psnr:g}: expected 0 to 150 dB")

@@ -74,8 +74,7 @@ def cut(volume: Volume, options: ReadOptions) -> Volume:
         mask = crop(mask, box)
     volume = volume if box is None else crop(volume, box)
     if mask is not None and placed and mask.dims == volume.dims:
-        why = "resample it onto that grid, or correct the place in its header"
-        mask.check_grid(f"--mask {mask.name}", volume, volume.name, why)
+        mask.check_grid(f"--mask {mask.name}", volume, volume.name, "resample it onto that grid, or mend its header")
     volume = volume if mask is None else masked(volume, mask, options.stored)
     if options.keep_largest is None:
         return volume

@@ -374,9 +374,8 @@ def imagej_facts(stated: dict[str, Any], resolution: tuple[float | None, float |
         scales = dict(zip(*(str(stated.get(key, "")).split(",") for key in ("axes", "scales")), strict=False))
         x, y, z = (_positive(scales.get(axis)) for axis in "XYZ")
         resolution, tag, stated = (x and 1 / x, y and 1 / y), 1, {"spacing": z, **stated}
-    zero = triple(
-        float(np.nan_to_num(_number(str(stated.get(f"{axis}origin"))) or 0.0, posinf=0, neginf=0)) for axis in "xyz"
-    )
+    origin = [_number(str(stated.get(f"{axis}origin"))) or 0.0 for axis in "xyz"]
+    zero = triple(np.nan_to_num(origin, posinf=0, neginf=0).tolist())
     channels, slices, frames = (int(stated.get(key, 1)) for key in ("channels", "slices", "frames"))
     images, assumed, name = channels * slices * frames, [], str(stated.get("unit", "")).strip()
     unit, per = _unit(name), _PER.get(tag, "")
