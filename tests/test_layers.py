@@ -16,7 +16,7 @@ from tests.refused import refused
 from tests.test_labels import SMALL, balls
 from vvgt_cli.cameras import default_views
 from vvgt_cli.dvr import RenderSettings, render_view, render_view_reference
-from vvgt_cli.dvr.layers import Layer, common_grid, grid_of, same_grid
+from vvgt_cli.dvr.layers import Layer, common_grid, grid_of
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.layered import ALL, open_content
 from vvgt_cli.field.source import SourceRequest, load, parse_layer
@@ -106,6 +106,13 @@ def test_a_mask_without_a_place_is_applied_voxel_by_voxel(how: dict) -> None:
         np.testing.assert_array_equal(np.isfinite(part), keep[:, :2, 1:] if "crop" in how else keep)
     with pytest.warns(UserWarning, match="--mask lost: states no place; applied voxel by voxel"):
         cut(replace(volume, space="RAS"), ReadOptions(mask=Volume(keep, space="RAS", name="lost"), **how))
+    there = Volume(keep, space="RAS", direction=(-1, 0, 0, 0, -1, 0, 0, 0, 1), origin=(4, 3, 0))
+    part = cut(replace(there, data=np.ones_like(volume.data)), ReadOptions(mask=Volume(keep, space="RAS"))).data
+    np.testing.assert_array_equal(np.isfinite(part), keep[:, ::-1, ::-1])  # the defaults are its place, and it fits
+    wide = replace(volume, space="RAS", spacing=(2.03, 2, 2))
+    refused(DataError, "expected the grid of", cut, volume, ReadOptions(mask=replace(wide, space=None, data=keep)))
+    oblique = replace(volume, direction=(0.8, 0.6, 0, -0.6, 0.8, 0, 0, 0, 1), data=keep)
+    refused(DataError, "expected the grid of", cut, volume, ReadOptions(mask=oblique, spacing=(1, 1, 1)))
 
 
 def test_of_scalars_and_labels_on_the_command_line(vvgt, tmp_path: Path) -> None:
@@ -482,8 +489,8 @@ def test_the_grid_is_as_fine_as_the_finest_layer() -> None:
     assert target.dims == (12, 20, 16)
     np.testing.assert_allclose(target.extent, first.extent)
     np.testing.assert_allclose(target.unit_frame().centre, first.unit_frame().centre)
-    assert same_grid(target, replace(target, origin=tuple(v + 1e-5 for v in target.origin)))
-    assert not same_grid(target, replace(target, origin=tuple(v + 0.1 for v in target.origin)))
+    assert target.on_grid(replace(target, origin=tuple(v + 1e-5 for v in target.origin)))
+    assert not target.on_grid(replace(target, origin=tuple(v + 0.1 for v in target.origin)))
 
 
 def test_labels_are_not_interpolated_on_a_finer_grid() -> None:

@@ -195,7 +195,7 @@ def claim(path: str | os.PathLike[str]) -> Iterator[None]:
     """
     target = linked(path)
     lock = target.with_name(f".{target.name[:200]}.lock")
-    held = None if is_stream(target) else _lock(lock, target)
+    held = None if is_stream(path) else _lock(lock, target)
     try:
         yield
     finally:

@@ -129,8 +129,8 @@ def _parts(
     """
     source = request.source
     labels = source.labels or (None if layer else AUTO)
-    scalars = labels == NO_LABELS or (labels is None and (source.tf is not None or not recognised(content.volumes[0])))
-    if not content.overlapping and (scalars or not content.single_volume):
+    plain = labels == NO_LABELS or not content.single_volume or (labels is None and source.tf is not None)
+    if not content.overlapping and (plain or (labels is None and not recognised(content.volumes[0]))):
         name = layer or content.volumes[0].name
         whole = replace(source, volume=content) if request.blocks is None else source
         return [(Item(name, UNSAFE.sub("-", name), replace(request, source=whole)), None)]

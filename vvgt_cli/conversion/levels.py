@@ -19,7 +19,7 @@ from vvgt_cli.conversion.cut import Levels, StoredGaussians
 from vvgt_cli.conversion.level_selection import CutErrors
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.digests import digest
-from vvgt_cli.files import atomic_write, linked, write_bytes
+from vvgt_cli.files import atomic_write, write_bytes
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats.page_file import upright
 from vvgt_cli.gaussians.formats.sog import IMAGES, META, images_of, webp
@@ -59,7 +59,7 @@ def write_levels(
     if ply.frame != "unit":
         raise UsageError(f"-o {output}: levels need distances in the unit frame; remove --frame")
     cut, stored, errors, choices = levels.cut, levels.stored, levels.errors, levels.choices
-    target, counts = linked(output), stored.field("counts")
+    target, counts = Path(output), stored.field("counts")
     before, folder = level_files(target), target.absolute().parent
     parts, places = divide(counts)
     axes, options = np.array(cut.plan.axes).reshape(3, 3), replace(upright(cut.plan.ply), comments=False)

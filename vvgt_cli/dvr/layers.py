@@ -19,7 +19,6 @@ from vvgt_cli.volume import Volume, triple
 from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.stored import read_block
 
-SAME = 1e-3  # voxels up to which two grids are one
 SLAB = 16  # slices that are laid out at once
 MAX_SCALARS = 7  # layers that rays classify: `march` has room for so many; others are classified at voxels
 FARTHEST = 1e30  # largest coordinate in a table, so that all are finite
@@ -98,13 +97,6 @@ class Layer:
         return float(extinction(np.array(1.0), self.unit_distance))
 
 
-def same_grid(a: Volume, b: Volume) -> bool:
-    """Return whether two volumes' voxels lie at the same places, to `SAME` voxels."""
-    corners = np.array([[0, 0, 0, 1], [*a.dims, 1], [a.dims[0], 0, 0, 1], [0, a.dims[1], 0, 1]], np.float64)
-    off = (corners @ (a.affine - b.affine).T)[:, :3]
-    return a.dims == b.dims and bool(np.abs(off).max() <= SAME * min(a.spacing))
-
-
 def common_grid(layers: Sequence[Layer], stored: bool = False) -> Volume:
     """Return the grid on which layers are added: the first one's box, the finest voxels along each axis; no values.
 
@@ -122,7 +114,7 @@ def common_grid(layers: Sequence[Layer], stored: bool = False) -> Volume:
                 "be right",
                 stacklevel=3,
             )
-        if same_grid(first, layer.volume):
+        if layer.volume.on_grid(first):
             continue
         inner = np.linalg.inv(layer.volume.affine) @ first.affine
         _check_meeting(first, layer.volume, inner)
@@ -170,7 +162,7 @@ def grid_box(layers: Sequence[Layer], target: Volume, lo: np.ndarray, hi: np.nda
     """Return `grid_of` for its voxels ``lo`` to ``hi`` (3,), x first: the same values whatever the box."""
     out = np.zeros((*(hi - lo)[::-1], 4), np.float32)
     for layer in layers:
-        if same_grid(layer.volume, target):
+        if layer.volume.on_grid(target):
             out += layer.box(lo, hi)
         elif layer.interpolated:
             out += layer.classify(_values_in(layer, target, lo, hi))
@@ -245,7 +237,7 @@ def _values_in(layer: Layer, target: Volume, lo: np.ndarray, hi: np.ndarray, rim
     def read(first: np.ndarray, last: np.ndarray) -> np.ndarray:
         return volume.slope * read_block(volume, first, last)[..., None].astype(np.float64) + volume.intercept
 
-    values = read(lo, hi) if same_grid(volume, target) else _placed(layer, target, lo, hi, read, np.nan, rim)
+    values = read(lo, hi) if volume.on_grid(target) else _placed(layer, target, lo, hi, read, np.nan, rim)
     return values[..., 0]
 
 

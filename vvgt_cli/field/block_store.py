@@ -125,6 +125,8 @@ class BlockStore:
         except FileNotFoundError as error:
             text = f"{path}: block {number} is missing; remove its other files and run its shard again"
             raise DataError(text) from error
+        except MemoryError:
+            raise
         except Exception as error:
             text = f"{path}: damaged ({error}); remove the block's files and run the same command again"
             raise DataError(text) from error

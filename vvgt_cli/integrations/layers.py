@@ -12,11 +12,12 @@ import numpy as np
 
 from vvgt_cli.commands.convert import convert
 from vvgt_cli.conversion.result import Conversion
-from vvgt_cli.dvr.layers import MAX_FINER, SAME
+from vvgt_cli.dvr.layers import MAX_FINER
 from vvgt_cli.field.layered import OpenedFile
 from vvgt_cli.library.inputs import LightLike, Look, source_of
 from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.volume import Volume, triple
+from vvgt_cli.volume.types import ALIKE
 
 AROUND = "around"  # name of an empty volume that holds all
 
@@ -46,7 +47,7 @@ def _ordered(layers: Sequence[Layer]) -> list[Layer]:
     everything = np.concatenate(corners)
     for k, v in enumerate(volumes):
         index = (everything - v.origin) @ np.linalg.inv(v.axes).T / v.spacing
-        if (index > -0.5 - SAME).all() and (index < np.array(v.dims) - 0.5 + SAME).all():
+        if (index > -0.5 - ALIKE).all() and (index < np.array(v.dims) - 0.5 + ALIKE).all():
             return [layers[k], *layers[:k], *layers[k + 1 :]]
     low, high = everything.min(axis=0), everything.max(axis=0)
     dims = np.ceil((high - low) / (MAX_FINER * min(min(v.spacing) for v in volumes))).astype(int)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from numbers import Real
 from typing import Any, BinaryIO, Protocol, TypeAlias, TypedDict
@@ -230,7 +230,7 @@ def _options(reading: Mapping[str, Any]) -> ReadOptions:
         raise UsageError("affine and origin are for arrays, and files have their own; remove them")
     for key in ("dims", "spacing"):
         if given.get(key) is not None:
-            if not isinstance(given[key], Iterable):
+            if np.ndim(given[key]) != 1:
                 raise UsageError(f"{key}: {given[key]!r}; expected three numbers, along x, y and z")
             given[key] = tuple(float(v) if key == "spacing" else int(v) for v in given[key])
     if not isinstance(given.get("crop", ""), str | None):

@@ -69,11 +69,13 @@ def cut(volume: Volume, options: ReadOptions) -> Volume:
     how = ReadOptions(stored=options.stored)
     mask = read_volume(options.mask, how) if isinstance(options.mask, str) else options.mask
     turned = None if mask is None else laid(mask, volume)
-    placed, mask = turned is not None and options.spacing is None, turned or mask
+    placed, mask = turned is not None, turned or mask
     if mask is not None and box is not None and mask.dims == volume.dims:
         mask = crop(mask, box)
     volume = volume if box is None else crop(volume, box)
     if mask is not None and placed and mask.dims == volume.dims:
+        if options.spacing is not None:  # which is both volumes'
+            mask = replace(mask, spacing=volume.spacing, origin=volume.origin)
         mask.check_grid(f"--mask {mask.name}", volume, volume.name, "resample it onto that grid, or mend its header")
     volume = volume if mask is None else masked(volume, mask, options.stored)
     if options.keep_largest is None:

@@ -82,22 +82,29 @@ def laid(mask: Volume, volume: Volume) -> Volume | None:
     stated = [bool(v.space or any(v.origin) or v.direction != IDENTITY) for v in (mask, volume)]
     if not all(stated) or mask.space != volume.space:
         return None
-    if (np.abs(mask.affine) == np.eye(4)).all() and (np.abs(volume.affine) != np.eye(4)).any():
-        warnings.warn(f"--mask {mask.name}: states no place; applied voxel by voxel", stacklevel=3)
-        return None
-    if (own := metres(mask.unit)) and (other := metres(volume.unit)):
+    lost = (np.abs(mask.affine) == np.eye(4)).all()
+    if mask.space is None and (own := metres(mask.unit)) and (other := metres(volume.unit)):
         spacing, origin = (triple(v * own / other for v in lengths) for lengths in (mask.spacing, mask.origin))
         mask = replace(mask, spacing=spacing, origin=origin, unit=volume.unit)
     signs = np.rint(np.linalg.inv(mask.axes) @ volume.axes)
     across = np.abs(signs)
-    if (across.sum(0) != 1).any() or (across.sum(1) != 1).any() or isinstance(mask.data, Stored):
-        return mask
+    if (across.sum(0) == 1).all() and (across.sum(1) == 1).all() and not isinstance(mask.data, Stored):
+        mask = _turned(mask, signs)
+    if lost and not mask.on_grid(volume):
+        warnings.warn(f"--mask {mask.name}: states no place; applied voxel by voxel", stacklevel=3)
+        return None
+    return mask
+
+
+def _turned(volume: Volume, signs: np.ndarray) -> Volume:
+    """Return a volume with other index axes; ``signs`` (3, 3) takes steps along them to steps along its own."""
+    across = np.abs(signs)
     flips = tuple(slice(None, None, -1 if sign < 0 else 1) for sign in signs.sum(0)[::-1])
-    data = mask.data.transpose([2 - k for k in across.argmax(0)[::-1]])[flips]
-    lengths = np.array(mask.spacing) @ across
-    first = mask.affine @ [*np.where(signs.sum(1) < 0, np.array(mask.dims) - 1, 0), 1]
-    direction = tuple((mask.affine[:3, :3] @ signs / lengths).ravel().tolist())
-    return replace(mask, data=data, spacing=triple(lengths), origin=tuple(first[:3].tolist()), direction=direction)
+    data = volume.data.transpose([2 - k for k in across.argmax(0)[::-1]])[flips]
+    lengths = np.array(volume.spacing) @ across
+    first = volume.affine @ [*np.where(signs.sum(1) < 0, np.array(volume.dims) - 1, 0), 1]
+    direction = tuple((volume.affine[:3, :3] @ signs / lengths).ravel().tolist())
+    return replace(volume, data=data, spacing=triple(lengths), origin=tuple(first[:3].tolist()), direction=direction)
 
 
 def metres(unit: str) -> float | None:
