@@ -29,7 +29,7 @@ LEAST_CELLS = 8  # a Gaussian, of cells on disk
 OF_VALUES = 20  # cells a Gaussian that stands for any function, which is seldom small (5: -1 dB)
 FINEST = -2  # cells of a quarter voxel at most
 MIN_CELL = 1.2  # pixels: a smaller base cell cannot be told from its neighbours
-NEARLY = 0.99  # share of the budget
+NEARLY = 0.99  # share of the budget, of which up to 7 more are missing: cells are split by eights
 MARCH_SIZE = 128  # pixels of the visibility march
 FEW = 0.04  # share of hidden cells that are left where they are: of some fogs, which lose by it
 SMALLER = 1.75  # power: of smaller cells more are hidden (2: fogs lose 0.2 dB, 1.5: bone loses as much)
@@ -200,11 +200,6 @@ def level_within(step: np.ndarray, voxels: float, most: float, finest: int) -> i
 def finest_level(step: np.ndarray, pixel: float) -> int:
     """Return the level of cells that pixels just resolve; ``step`` (3,) voxel, ``pixel`` pixel edges, unit frame."""
     return max(FINEST, math.floor(math.log2(MIN_CELL * pixel / float(step.min()))))
-
-
-def used_up(count: int, budget: int) -> bool:
-    """Return whether ``count`` Gaussians are a budget: cells are split by eights, so that a few are always missing."""
-    return count + 7 >= NEARLY * budget
 
 
 def bound(form: ClosedForm) -> str:

@@ -406,10 +406,10 @@ class FinishedParts:
 
     def why_fewer(self) -> str:
         """Return the reason, to end a message with, why there are fewer Gaussians than the budget, if so."""
-        from vvgt_cli.closed_form.closed_form import used_up
+        from vvgt_cli.closed_form.closed_form import NEARLY
 
         budget = self.cut.plan.budget
-        if self.removed or used_up(len(self), budget):
+        if self.removed or len(self) + 7 >= NEARLY * budget:
             return ""
         return f", no more: {self.cut.pyramid.base} cells suffice for the screen and {budget} Gaussians"
 

@@ -76,7 +76,7 @@ def laid(mask: Volume, volume: Volume) -> Volume | None:
     """Return a mask with its index axes in the order and directions of a volume's, if it has these axes in memory.
 
     Return None where one of both states no place, or not in the same space: then voxels are all that compares. A mask
-    whose voxels are one unit of a space, from its origin on, has lost its place, which a warning says.
+    that states the defaults of files, under which it does not fit, has lost its place, which a warning says.
     """
     mask = in_space(mask, volume.space) if mask.space and volume.space else mask
     stated = [bool(v.space or any(v.origin) or v.direction != IDENTITY) for v in (mask, volume)]
@@ -89,22 +89,16 @@ def laid(mask: Volume, volume: Volume) -> Volume | None:
     signs = np.rint(np.linalg.inv(mask.axes) @ volume.axes)
     across = np.abs(signs)
     if (across.sum(0) == 1).all() and (across.sum(1) == 1).all() and not isinstance(mask.data, Stored):
-        mask = _turned(mask, signs)
+        flips = tuple(slice(None, None, -1 if sign < 0 else 1) for sign in signs.sum(0)[::-1])
+        data = mask.data.transpose([2 - k for k in across.argmax(0)[::-1]])[flips]
+        lengths = np.array(mask.spacing) @ across
+        first = mask.affine @ [*np.where(signs.sum(1) < 0, np.array(mask.dims) - 1, 0), 1]
+        turned = tuple((mask.affine[:3, :3] @ signs / lengths).ravel().tolist())
+        mask = replace(mask, data=data, spacing=triple(lengths), origin=tuple(first[:3].tolist()), direction=turned)
     if lost and not mask.on_grid(volume):
         warnings.warn(f"--mask {mask.name}: states no place; applied voxel by voxel", stacklevel=3)
         return None
     return mask
-
-
-def _turned(volume: Volume, signs: np.ndarray) -> Volume:
-    """Return a volume with other index axes; ``signs`` (3, 3) takes steps along them to steps along its own."""
-    across = np.abs(signs)
-    flips = tuple(slice(None, None, -1 if sign < 0 else 1) for sign in signs.sum(0)[::-1])
-    data = volume.data.transpose([2 - k for k in across.argmax(0)[::-1]])[flips]
-    lengths = np.array(volume.spacing) @ across
-    first = volume.affine @ [*np.where(signs.sum(1) < 0, np.array(volume.dims) - 1, 0), 1]
-    direction = tuple((volume.affine[:3, :3] @ signs / lengths).ravel().tolist())
-    return replace(volume, data=data, spacing=triple(lengths), origin=tuple(first[:3].tolist()), direction=direction)
 
 
 def metres(unit: str) -> float | None:

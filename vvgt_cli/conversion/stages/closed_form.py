@@ -49,7 +49,7 @@ class ClosedFormStage(Stage):
     def run(self, work: Work) -> None:
         """Make the Gaussians, or load them from the checkpoint, without the pyramid; raise NothingVisible for none."""
         from vvgt_cli.closed_form import Start, VbmOptions
-        from vvgt_cli.closed_form.closed_form import bound, used_up
+        from vvgt_cli.closed_form.closed_form import NEARLY, bound
 
         run, fit, source = work.run, work.fit, work.field.source
         whole = self.recut or (self.recut_by_error and work.checkpoint.load(CELLS) is None)
@@ -69,7 +69,7 @@ class ClosedFormStage(Stage):
             made = len(start.gaussians)
             start, removed = thinned(start)
             stage.note = f"{len(start.gaussians)} Gaussians" + f" ({fit.init})" * (fit.init != INIT)
-            if start.form is not None and not removed and not used_up(made, fit.max_gaussians):
+            if start.form is not None and not removed and made + 7 < NEARLY * fit.max_gaussians:
                 stage.note += f", no more: {bound(start.form)}"
         if removed:
             run.skip(f"{removed} Gaussians", TOO_FAINT)
