@@ -94,6 +94,15 @@ CASES = {
             "report": ("report", "v.raw", *RAW),
         }.items()
     },
+    **{
+        f"{words[0]} to a stream": ((*words, "-"), 2, f"{words[-1]} -: standard output takes a .ply or JSON")
+        for words in (
+            ("synth", "tubes", "-o"),
+            ("tf", "show", "good.json", "-o"),
+            (*CONVERT, "--preview"),
+        )
+    },
+    "view title": (("view", "gaussians.ply", "--title", "a"), 2, "--title is for a page that is saved"),
     "render both": (("render", "not.ply", "-o", "d", "--orbit", 1, "--camera", "c.json"), 2, "either"),
     "render background": (("render", "not.ply", "-o", "d", "--orbit", 1, "--background", 0, 0, 255), 2, "[0, 1]"),
     "render cameras": (("render", "not.ply", "-o", "d", "--camera", "good.json"), 1, "frames"),

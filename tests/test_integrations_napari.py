@@ -114,6 +114,9 @@ def test_a_first_axis_is_time(viewer, tmp_path) -> None:
     layer = viewer.add_image(steps, contrast_limits=(0, 90), scale=(1, 2, 1, 0.5), translate=(0, 5, 6, 7))
     places = [np.array(layer.data_to_world((k, *np.add(POINT, shift))))[:0:-1] for k, shift in ((0, 0), (1, (3, 0, 2)))]
     saved(viewer, tmp_path / "t.splats.ply")
+    longer = viewer.add_image(np.zeros((3, 4, 4, 4), np.float32))
+    refused(vvgt_cli.UsageError, "time axes differ", saved, viewer, tmp_path / "u.ply")
+    viewer.layers.remove(longer)
     for k, place in enumerate(places):
         assert heaviest(tmp_path / f"t.splats_{k:04d}.ply") == pytest.approx(place, abs=0.01)
     viewer.add_image(steps, contrast_limits=(0, 90))

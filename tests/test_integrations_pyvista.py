@@ -98,7 +98,7 @@ def test_a_point_is_where_the_plotter_has_it(tmp_path: Path) -> None:
     shown.volume.SetOrientation(10, 20, 30)
     shown.volume.SetPosition(3, -2, 1)
     shown.volume.SetScale(1.5)
-    vvgt.export_plotter(shown, tmp_path / "a.ply", {**FINE, "steps": 0})
+    vvgt.export_plotter(shown, tmp_path / "a.ply", **{**FINE, "steps": 0})
     there = shown.volume.GetMatrix().MultiplyPoint((*LUMP, 1))[:3]
     voxel, middle = places(tmp_path / "a.ply")
     assert voxel == pytest.approx(np.array(there), abs=0.001)

@@ -297,6 +297,12 @@ def test_a_conversion_says_nothing_unless_asked(field, capfd):
     assert "closed form" in capfd.readouterr().err
 
 
+@pytest.mark.parametrize("option", [{"space": "LPS"}, {"suv": "none"}, {"dtype": "int16"}])
+def test_what_a_dataset_says_itself_is_refused(field, option):
+    for data in (xarray.DataArray(field, dims=("z", "y", "x")), pyvista.wrap(field)):
+        refused(vvgt.UsageError, f"{next(iter(option))}: a ", vvgt.read_volume, data, **option)
+
+
 def test_a_dataset_of_xarray_and_curvilinear_places(field):
     at = {"z": 2.0 * np.arange(field.shape[0]), "lon": (("y", "x"), field[0]), "lat": (("y", "x"), field[0])}
     dataset = xarray.Dataset({"a": (("z", "y", "x"), field), "b": (("z", "y", "x"), -field)}, at)

@@ -120,6 +120,9 @@ def test_recolor_uses_the_given_light_or_that_of_the_function_or_the_file(vvgt, 
             "scores"
         ]["psnr"]
     assert scores["headlight"] > scores["none"] - 2
+    bare = ("evaluate", lit_file, "--volume", "example:marschner-lobb:20", "--json", "--no-conditions", "--step", 1)
+    own, dark = (json.loads(vvgt(*bare, "--screen", 48, *how).out)["scores"] for how in ((), ("--light", "none")))
+    assert dark["psnr"] > own["psnr"] + 3  # under the function that the volume gets without --tf, the file has another
     vvgt.ok("render", lit_file, "--light", "x", "--orbit", 1, "--size", 32, "-o", tmp_path / "a")
     vvgt.ok("render", lit_file, "--orbit", 1, "--size", 32, "-o", tmp_path / "b")
     assert next((tmp_path / "a").glob("*.png")).read_bytes() != next((tmp_path / "b").glob("*.png")).read_bytes()

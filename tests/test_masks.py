@@ -17,7 +17,7 @@ import zarr
 
 from tests.test_volume_amira import amira
 from vvgt_cli.conversion.frames import is_glob_of_volumes
-from vvgt_cli.field.source import SourceRequest, load
+from vvgt_cli.field.source import SourceRequest, load, parse_layer
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.look.label_files import table_for
 from vvgt_cli.volume import ReadOptions, read_volume
@@ -266,3 +266,17 @@ def test_a_header_without_a_table_says_nothing(tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert read_volume(nifti(tmp_path, "a comment" * 99)).segments is None
+
+
+def test_a_layer_goes_into_the_space_and_unit_of_the_first(tmp_path: Path) -> None:
+    values = np.random.default_rng(1).random((10, 12, 14)).astype(np.float32)
+    first = Volume(values, spacing=(1.0, 2.0, 0.5), origin=(5.0, -3.0, 2.0), space="LPS")
+    image = nibabel.Nifti1Image(first.data.T, np.diag([-1.0, -1.0, 1.0, 1.0]) @ first.affine)
+    nibabel.save(image, tmp_path / "same.nii")  # RAS, the same place
+    source = load(SourceRequest(first, tf="gray", layers=(parse_layer(f"{tmp_path / 'same.nii'},tf=gray"),)))
+    np.testing.assert_allclose(source.layers[1].volume.affine, first.affine)
+    assert source.volume.on_grid(first)
+    large = Volume(values, spacing=(1.0, 2.0, 0.5), origin=(5.0, -3.0, 2.0), unit="mm")
+    small = Volume(values, spacing=(1000.0, 2000.0, 500.0), origin=(5000.0, -3000.0, 2000.0), unit="um")
+    source = load(SourceRequest(large, tf="gray", layers=(SourceRequest(small, tf="gray"),)))
+    np.testing.assert_allclose(source.layers[1].volume.affine, large.affine)

@@ -174,6 +174,8 @@ def test_no_file_names_the_volume_that_it_was_made_of(vvgt, tmp_path, small_scre
     assert b"<title>Case &lt;17&gt;</title>" in (tmp_path / "d.html").read_bytes()
     vvgt.ok("view", tmp_path / "a.ply", "--title", "other", "-o", tmp_path / "e.html")
     assert b"<title>other</title>" in (tmp_path / "e.html").read_bytes()
+    vvgt.ok("view", tmp_path / "a.ply", tmp_path / "a.ply", "--title", "both", "-o", tmp_path / "f.html")
+    assert b"<title>both</title>" in (tmp_path / "f.html").read_bytes()
 
 
 def test_the_page_of_one_volume_holds_its_values_and_look_unless_it_cannot(vvgt, tmp_path):

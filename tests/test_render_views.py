@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pytest
 
+import vvgt_cli
 from tests.processes import replaced
 from tests.refused import refused
 from tests.view_sets import BACKGROUND, BASE, TF, VOLUME, make_views
@@ -54,6 +55,11 @@ def test_the_folder_holds_what_the_page_says(made):
     model = [f"sparse/0/{name}.bin" for name in ("cameras", "images", "points3D")]
     texts = ["transforms.json", "transforms_train.json", "transforms_test.json", "manifest.json"]
     assert names == sorted([*images, *model, *texts, "points3d.ply", "contact.png"])
+
+
+@pytest.mark.parametrize("cameras", [[], [look_at((3, 0, 0)), look_at((0, 3, 0))]])
+def test_cameras_need_names_of_their_own(cameras, tmp_path):
+    refused(UsageError, "of one name", vvgt_cli.render_views, VOLUME, TF, tmp_path / "v", cameras=cameras)
 
 
 @pytest.mark.parametrize("split", ["train", "test"])

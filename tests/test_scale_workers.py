@@ -65,6 +65,7 @@ def test_shards_in_any_order_and_a_merge_leave_the_same_bytes(vvgt, raw, alone, 
     assert out.read_bytes() == alone
     assert vvgt("merge", folder, "-o", out).code == 2  # exists
     assert vvgt("merge", folder, "-o", "-").out == alone
+    assert "encodes it" in vvgt.fails(2, "merge", folder, "-o", tmp_path / "a.compressed.ply")
 
 
 def test_another_run_is_not_mixed_in(vvgt, raw, tmp_path):

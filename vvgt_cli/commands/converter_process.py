@@ -46,7 +46,7 @@ class MessageConsole(Console):
         super().__init__()
         self.send = send
 
-    def message(self, line: str) -> None:
+    def progress(self, line: str) -> None:
         """Send a line."""
         self.send(ConsoleLine(line))
 

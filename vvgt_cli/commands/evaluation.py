@@ -51,6 +51,7 @@ from vvgt_cli.score.viewing import (
 from vvgt_cli.score.views import preview as side_by_side
 from vvgt_cli.score.views import psnr_note, score_test_views, scored_views
 from vvgt_cli.splat.render import Shown
+from vvgt_cli.volume import ReadOptions
 
 PICTURED = 4  # test view of the preview: from the side
 MIDDLE = 200  # pixels along the edge of what the reference's own error is measured on
@@ -147,7 +148,7 @@ def shown(gaussians: Gaussians, header: PlyHeader, source: StyledVolume, request
     Raises:
         UsageError: labels are requested for values, or the reverse.
     """
-    if header.live is None or (request.labels is None and request.tf is None and not request.layers):
+    if header.live is None or replace(request, volume="", read=ReadOptions()) == SourceRequest(""):
         return gaussians
     carried = ["labels" if one.labels else "values" for one in header.live.layers]
     shown = ["labels" if isinstance(layer.tf, LabelTable) else "values" for layer in source.layers]

@@ -72,7 +72,7 @@ def command(console: Console, **options: Any) -> None:
 
     Example:
       vvgt render-views head.nrrd --tf bone.json -o views
-      vvgt init head.nrrd --tf bone.json -o - | vvgt infer - --views views --model small -o head.ply
+      vvgt init head.nrrd --tf bone.json -o - | vvgt infer - --views views --model vvgt-small -o head.ply
     """
     infer(**options, progress=console)
 
@@ -95,7 +95,7 @@ def _improved(name: str, folder: str, model: str, provider: str, run: Run) -> Re
 
     import numba
 
-    from vvgt_cli.conversion.gaussian_files import layout_of, open_gaussians
+    from vvgt_cli.conversion.gaussian_files import file_rule, layout_of, open_gaussians
     from vvgt_cli.conversion.result import Result
     from vvgt_cli.images.files import load_views
     from vvgt_cli.jit.ahead import INFER
@@ -107,15 +107,18 @@ def _improved(name: str, folder: str, model: str, provider: str, run: Run) -> Re
         network = Model.open(find_model(model), numba.get_num_threads(), provider)
         gaussians, header = open_gaussians(name)
         cameras, images = load_views(folder, "train")
+        edge = cameras[0].width
+        rule = file_rule(header).at(edge / (header.screen_size or edge))
         read, check_views = divide(cameras, network.card.network.total_views)
         stage.note = f"{len(gaussians)} Gaussians, {len(cameras)} views, model {network.card.name}"
     run.compile(INFER)
     with run.stage("network") as stage:
         shown = [cameras[i] for i in read]
-        better = network.improve(gaussians, shown, images[read], progress=run.console.bar("network"))
+        better = network.improve(gaussians, shown, images[read], progress=run.console.bar("network"), rule=rule)
         stage.note = f"reads {len(read)} views"
     with run.stage("check views") as stage:
-        before, after = map(Views(cameras, images).take(check_views).psnr, (gaussians, better))
+        views = Views(cameras, images).take(check_views)
+        before, after = views.psnr(gaussians, rule), views.psnr(better, rule)
         stage.psnr, stage.kept = after, after > before
         own = "" if set(check_views) - set(read) else ", all read by the network"
         stage.note = f"from {before:.2f} dB on {len(check_views)} views{own}"

@@ -332,6 +332,7 @@ def what_leaves(file: str) -> dict[str, Any]:
         "place": header.affine and f"position and directions in the {'scanner' if scanned else 'world'}",
         "story": [step["text"] for step in scene.get("story", ())],
         "saved view, with its rulers, notes and story": unquote(scene.get("link", "")),
+        "light": header.light and header.light.sky,
         "camera": header.camera and "eye and target in the world",
         "values": held or (layers and "data values under each Gaussian, and their histogram"),
         "other": [line for line in header.comments if not line.startswith(OURS)],

@@ -39,13 +39,11 @@ def show(
     Example:
       vvgt tf show bone.json -o bone.png --volume head.nrrd
     """
-    from vvgt_cli.gaussians.outputs import STDOUT, Output, check_outputs
+    from vvgt_cli.gaussians.outputs import Output, check_outputs
     from vvgt_cli.look import draw, read_transfer_function, resolve
     from vvgt_cli.volume import ReadOptions, read_volume, statistics
 
     options = ReadOptions(**read)
-    if output == STDOUT:
-        raise UsageError("-o -: a picture goes to a file; expected a name ending in .png")
     if volume is None and (tf_range != "data" or options != ReadOptions()):
         raise UsageError("--tf-range and reading options need --volume")
     check_outputs([Output("-o", output, (".png",))], [tf, volume], overwrite)

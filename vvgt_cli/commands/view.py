@@ -33,7 +33,7 @@ def view(
         port: of the server; None takes a free one. Its address is printed.
         browser: open one, if there is a display.
         values: let a page of a volume hold its values, for slices and other looks.
-        title: of the page; None: the file's own.
+        title: of the page that is written; None: the file's own.
         story: for the page to tell, a story.json or its content (docs/page.md).
         overwrite: replace the output if it exists.
         progress: print messages on standard error.
@@ -53,8 +53,9 @@ def view(
 
     if output is not None and (port is not None or not browser):
         raise UsageError("-o writes a file and starts no server; omit --port and --no-browser")
-    if output is None and not values:
-        raise UsageError("--no-values is for a page that is saved; give -o OUT.html, or omit it")
+    if output is None and (title or not values):
+        option = "--no-values" if not values else "--title"
+        raise UsageError(f"{option} is for a page that is saved; give -o OUT.html, or omit it")
     if story is not None and not is_page(output):
         raise UsageError("--story is for a page that is saved; give -o OUT.html, or omit it")
     told = None if story is None else read_story(story)
@@ -62,7 +63,7 @@ def view(
     clouds, run = named_files([os.fspath(name) for name in names]), Run(console_of(progress), ConversionReport("view"))
     source = source_of(clouds[0][1], look, reading)
     if output is None:
-        viewer.show(run, clouds, source, title, port or 0, browser, click.echo)
+        viewer.show(run, clouds, source, port or 0, browser, click.echo)
     else:
         viewer.save(run, clouds, source, os.fspath(output), values=values, title=title, story=told, overwrite=overwrite)
 

@@ -374,6 +374,8 @@ def write_views(
         UsageError: a folder with another run's views or unknown files, or options that do not fit.
         DataError: invalid input, or a function that shows nothing.
     """
+    if not views or len({view.stem for view in views}) < len(views):
+        raise UsageError(f"cameras: {len(views)}, or two of one name; expected some, each with a name of its own")
     folders, asked = folders_of(output, list(requests)), list(requests.values())
     rays, shard = rays or Rays(), shard or Shard()
     with ExitStack() as stack:
@@ -399,7 +401,7 @@ def _settings(layout: Layout, rays: Rays, views: Sequence[View], source: StyledV
         "volume": content,
         "function": source.look(),
         "opacity_unit_distance": source.unit_distance,
-        **({} if source.lighting is None else {"light": source.lighting.text()}),
+        **({} if source.lighting is None else {"light": source.lighting.key()}),
         "views": len(cameras["train"]),
         "test_views": len(cameras["test"]),
         "size": ", ".join(sizes),

@@ -12,7 +12,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vvgt_cli.commands.converter import Converter
 from vvgt_cli.commands.live_site import BYTES, HTML, JSON, SCRIPT, PageController, plain_name, stored
@@ -22,10 +22,9 @@ from vvgt_cli.conversion.gaussian_files import STDIN, layout_of, open_gaussians,
 from vvgt_cli.conversion.index import FRAMES, is_pattern, named_files
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.source import SourceRequest
-from vvgt_cli.gaussians import Gaussians, PlyOptions
+from vvgt_cli.gaussians import PlyHeader, PlyOptions
 from vvgt_cli.gaussians.formats import SUFFIXES, is_page, is_splats
 from vvgt_cli.gaussians.formats.page_file import PROGRAM, VIEWER, asked, asset, camera, farthest, page
-from vvgt_cli.gaussians.formats.page_values import Values
 from vvgt_cli.gaussians.formats.sog import IMAGES, META
 from vvgt_cli.gaussians.formats.splats import columns_of
 from vvgt_cli.gaussians.formats.streamed import MANIFEST, corners, is_streamed, placed, read_manifest
@@ -34,9 +33,6 @@ from vvgt_cli.gaussians.rules import INRIA
 from vvgt_cli.gaussians.story import Story
 from vvgt_cli.jit.ahead import DRAW, for_degree
 from vvgt_cli.score.record import Run
-
-if TYPE_CHECKING:
-    from vvgt_cli.conversion.request import ConvertRequest
 
 TICK = 0.2  # seconds within which Ctrl-C is answered
 SOON = 10.0  # seconds of reading after which a page is shown that waits; earlier failures are reported without one
@@ -54,25 +50,26 @@ def save(
     from vvgt_cli.conversion.convert_batch import convert_all
     from vvgt_cli.conversion.request import ConvertRequest
 
-    values = values and is_page(output)
-    file, request = clouds[0][1], ConvertRequest(source, values=values, title=title, story=story)
+    file = clouds[0][1]
     if len(clouds) > 1:
-        _join(run, output, clouds, source, story, overwrite)
-    elif _is_series(source):
-        if not is_page(output):
+        _join(run, output, clouds, source, title, story, overwrite)
+    elif file != STDIN and not is_splats(file):
+        if not is_page(output) and _is_series(source):
             raise UsageError(f"-o {output}: holds one frame; expected a page (.html), or --time N")
-        convert_all({"": replace(request, output=output, overwrite=overwrite)}, console=run.console)
+        request = ConvertRequest(source, output, values=values, title=title, story=story, overwrite=overwrite)
+        convert_all({"": request}, console=run.console)
     else:
         with claimed([Output("-o", output, SUFFIXES, splats=True)], [file], overwrite):
-            gaussians, options, held = _opened(run, file, request)
-            write_gaussians(run, output, gaussians, options, overwrite, values=held)
+            _refuse_reading(source, file)
+            gaussians, header = open_gaussians(file)
+            options = _layout(header, title, story and story.checked(()))
+            write_gaussians(run, output, gaussians, options, overwrite)
             run.compile(for_degree(DRAW, gaussians.degree))
             read_back(run, output, gaussians, options)
 
 
 def show(
-    run: Run, clouds: Named, source: SourceRequest, title: str | None, port: int, browser: bool,
-    announce: Callable[[str], None],
+    run: Run, clouds: Named, source: SourceRequest, port: int, browser: bool, announce: Callable[[str], None]
 ) -> None:  # fmt: skip
     """Show Gaussians or a volume until an interrupt; ``announce`` is called with the page's URL when it can be opened.
 
@@ -85,7 +82,7 @@ def show(
         _serve(run, clouds, source, port, browser, announce)
         return
     with tempfile.TemporaryDirectory(prefix="vvgt-") as folder:
-        quick = ConvertRequest(source, os.path.join(folder, "{}.ply"), FitOptions(steps=0), title=title)
+        quick = ConvertRequest(source, os.path.join(folder, "{}.ply"), FitOptions(steps=0))
         convert_all({"": quick}, console=run.console)
         frames = named_files(sorted(map(str, Path(folder).glob("*index.json"))))
         _serve(run, frames, SourceRequest(source.path), port, browser, announce)
@@ -103,7 +100,7 @@ def _is_series(source: SourceRequest) -> bool:
 
 
 def _join(
-    run: Run, output: str, clouds: Named, source: SourceRequest, story: Story | None, overwrite: bool
+    run: Run, output: str, clouds: Named, source: SourceRequest, title: str | None, story: Story | None, overwrite: bool
 ) -> None:  # fmt: skip
     """Write several files into one page."""
     files = [file for _, file in clouds]
@@ -122,7 +119,7 @@ def _join(
         shown, told, rules = list[Cloud](), story and story.checked((), len(files)), set[str]()
         for name, file in zip(names, files, strict=True):
             gaussians, header = open_gaussians(file)
-            layout = replace(layout_of(header), story=told)
+            layout = _layout(header, title, told)
             shown.append(Cloud(gaussians, run.report, layout, name, name, {}, None))
             rules.add(header.rule or INRIA.name)
         if len(rules) > 1:
@@ -153,18 +150,10 @@ def _only_gaussians(files: Sequence[str]) -> None:
         )
 
 
-def _opened(run: Run, name: str, request: ConvertRequest) -> tuple[Gaussians, PlyOptions, Values | None]:
-    """Return Gaussians in the unit frame, how to write them, and values for a page; a volume is converted."""
-    from vvgt_cli.conversion.convert import convert_one
-
-    if name == STDIN or is_splats(name):
-        _refuse_reading(request.source, name)
-        gaussians, header = open_gaussians(name)
-        options = layout_of(header)
-        story = request.story and request.story.checked(())
-        return gaussians, replace(options, title=request.title or options.title, story=story), None
-    conversion = convert_one(request, run.console)
-    return conversion.gaussians, conversion.ply, conversion.values(run) if request.values else None
+def _layout(header: PlyHeader, title: str | None, story: Story | None) -> PlyOptions:
+    """Return how Gaussians are written again, with a title, if it is given, and a story."""
+    layout = layout_of(header)
+    return replace(layout, title=title or layout.title, story=story)
 
 
 def _serve(

@@ -107,6 +107,8 @@ def command_line(ctx: click.Context, without: Collection[str] = (), folders: boo
             values = [_anonymous(parameter.name or "", v) for v in values]
         if parameter.name in without:
             continue
+        if parameter.name == "camera":
+            values = [",".join(values)]
         if isinstance(parameter, click.Argument):
             words += values
         elif isinstance(parameter, click.Option) and parameter.name in ctx.params:
@@ -118,7 +120,7 @@ def command_line(ctx: click.Context, without: Collection[str] = (), folders: boo
 
 def _anonymous(name: str, value: str) -> str:
     """Return the value of a parameter without folders and without names of volumes, examples excepted."""
-    if name == "volume":
+    if name in ("volume", "mask"):
         return value if value.startswith("example:") else "VOLUME"
     if name == "layers":
         file, *rest = _SETTINGS.split(value)

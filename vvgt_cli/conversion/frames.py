@@ -194,7 +194,7 @@ class FrameSeries(Batch):
             "function": digest(*looks),
             **({"layers": [repr(layer) for layer in request.source.layers]} if request.source.layers else {}),
             "opacity_unit_distance": self._distance,
-            **({} if lighting is None else {"light": lighting.text()}),
+            **({} if lighting is None else {"light": lighting.key()}),
             **({"live": True} if request.live else {}),
             "title": request.title,
             "values": request.values,

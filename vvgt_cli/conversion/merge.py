@@ -19,6 +19,7 @@ from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.blocked import MissingBlocks, Pass
 from vvgt_cli.field.open import runner_of, thread_count
 from vvgt_cli.field.settings import BlockOptions, worker_count
+from vvgt_cli.gaussians.formats import format_of
 from vvgt_cli.gaussians.formats.streamed import MANIFEST, folder_of, is_streamed
 from vvgt_cli.gaussians.outputs import STDOUT, Output, claimed
 from vvgt_cli.progress import Console
@@ -69,6 +70,8 @@ def merge(folder: str, output: str, overwrite: bool = False, console: Console | 
     plan, threads = CutPlan.load(store), thread_count()
     workers = worker_count(BlockOptions(), math.prod(plan.grid.blocks.dims), plan.budget, threads)
     endings = (MANIFEST,) if is_streamed(output) else (".ply",)
+    if not is_streamed(output) and format_of(output) is not None:
+        raise UsageError(f"-o {output}: expected a .ply, or lod-meta.json; 'vvgt view OUT.ply -o {output}' encodes it")
     with (
         folder_of(output),
         claimed([Output("-o", output, endings, splats=True)], [], overwrite),

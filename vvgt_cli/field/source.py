@@ -19,6 +19,7 @@ from vvgt_cli.look.histogram import UNIT_SHARE
 from vvgt_cli.look.labels import AUTO, NO_LABELS, LabelTable, check_labels, palette
 from vvgt_cli.look.lighting import Lighting, LightOptions
 from vvgt_cli.volume import ReadOptions, Statistics, Volume
+from vvgt_cli.volume.space import beside
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
@@ -86,7 +87,7 @@ def layer_words(text: str) -> list[str]:
     return [",".join(words[:n]), *(re.sub("^iso=", "tf=iso:", word) for word in words[n:])]
 
 
-def parse_layer(text: str, space: str | None = None) -> SourceRequest:
+def parse_layer(text: str) -> SourceRequest:
     """Parse a layer, ``FILE[,tf=TF][,iso=LEVEL][,labels=TABLE][,component=N]...``, or raise UsageError."""
     path, *rest = layer_words(text)
     given: dict[str, Any] = {}
@@ -102,7 +103,7 @@ def parse_layer(text: str, space: str | None = None) -> SourceRequest:
     if component is not None and component.isdecimal():
         component = int(component)
     tf, labels, distance = (given.pop(key, None) for key in ("tf", "labels", "distance"))
-    read = ReadOptions(component=component, space=space, **given)
+    read = ReadOptions(component=component, **given)
     return SourceRequest(path, read, tf, unit_distance=distance, labels=labels)
 
 
@@ -351,6 +352,7 @@ def _styled(
             raise UsageError(
                 f"{name}: {error.steps} time steps; expected one per layer: --layer FILE,time=N (0 to {last})"
             ) from None
+        inner = replace(inner, volumes=tuple(beside(volume, content.volumes[0]) for volume in inner.volumes))
         layers += layers_of(inner, other.tf, other.labels, other.tf_range, other.unit_distance, access=access)
     if request.layers:  # a frame's labels keep their looks: colours of its whole series are in use
         frames = bool(request.statistics) and isinstance(layers[0].tf, LabelTable)

@@ -43,7 +43,10 @@ class Output:
 
 
 def _check_one(output: Output, overwrite: bool) -> None:
+    endings = " or ".join(output.suffixes)
     if output.path == STDOUT:
+        if endings and not {".ply", ".json"} & set(output.suffixes):
+            raise UsageError(f"{output.option} -: standard output takes a .ply or JSON; expected a name in {endings}")
         if output.binary and sys.stdout.isatty():
             raise UsageError(f"{output.option} -: standard output is a terminal; redirect it to a file or a pipe")
         return
@@ -51,7 +54,7 @@ def _check_one(output: Output, overwrite: bool) -> None:
     if is_stream(path):
         return
     if output.suffixes and not path.name.lower().endswith(output.suffixes):
-        raise UsageError(f"{output.option} {path}: expected a name ending in {' or '.join(output.suffixes)}")
+        raise UsageError(f"{output.option} {path}: expected a name ending in {endings}")
     try:
         check_target(path, overwrite)
     except UsageError as error:

@@ -71,7 +71,7 @@ class Job:
         self.matrix.DeepCopy(numbers or [float(k % 5 == 0) for k in range(16)])
 
     def _in_shares(self) -> bool:
-        return self.count > 1 and self.name.endswith(".ply")
+        return self.count > 1 and self.name.endswith(".ply") and ".compressed." not in self.name
 
     def _path(self, name: str) -> str:
         return os.path.join(self.folder, name)

@@ -291,8 +291,7 @@ def requests_of(
 
 def with_look(source: SourceRequest, look: Look) -> SourceRequest:
     """Return the request for a source's volume under a look; errors are those of `function_of`."""
-    space = source.read.space
-    layers = tuple(x if isinstance(x, SourceRequest) else parse_layer(os.fspath(x), space) for x in look.layers)
+    layers = tuple(x if isinstance(x, SourceRequest) else parse_layer(os.fspath(x)) for x in look.layers)
     return replace(source, **look.asked(), layers=layers)
 
 
@@ -380,14 +379,15 @@ def volume_in_memory(
         DataError: not three axes, values that are not real numbers, a place that is not one.
         UsageError: options that the object does not take.
     """
-    placed = [key for key, value in (("origin", origin), ("affine", affine)) if value is not None]
+    given = {"origin": origin, "affine": affine, **{key: getattr(options, key) for key in ("space", "suv", "dtype")}}
+    placed = [key for key, value in given.items() if value is not None]
     if hasattr(data, "IsA") and not isinstance(data, np.ndarray):  # pyvista's arrays have the methods of VTK's
-        _refuse(placed, "a VTK dataset says itself where it is")
+        _refuse(placed, "a VTK dataset says itself what it holds and where it is")
         from vvgt_cli.volume.vtk.leaves import dataset_volume
 
         return dataset_volume(data, options, name, name)
     if hasattr(data, "dims") and hasattr(data, "coords") and hasattr(data, "attrs"):
-        _refuse(placed, "the coordinates of a DataArray say where it is")
+        _refuse(placed, "a DataArray says itself what it holds, and its coordinates where it is")
         return _labelled(data, options, name)
     if np.ma.is_masked(data):
         data = data.astype(np.promote_types(data.dtype, np.float32)).filled(np.nan)

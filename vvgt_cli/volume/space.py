@@ -72,20 +72,28 @@ def in_space(volume: Volume, wanted: str | None) -> Volume:
     return replace(volume, direction=direction, origin=origin, space=wanted)
 
 
+def beside(volume: Volume, other: Volume) -> Volume:
+    """Return a volume with its place in the anatomical space and the unit of length of another, if both state one."""
+    if volume.space and other.space:
+        return in_space(volume, other.space)
+    own, its = metres(volume.unit), metres(other.unit)
+    if volume.space or other.space or not (own and its) or own == its:
+        return volume
+    spacing, origin = (triple(v * own / its for v in lengths) for lengths in (volume.spacing, volume.origin))
+    return replace(volume, spacing=spacing, origin=origin, unit=other.unit)
+
+
 def laid(mask: Volume, volume: Volume) -> Volume | None:
     """Return a mask with its index axes in the order and directions of a volume's, if it has these axes in memory.
 
     Return None where one of both states no place, or not in the same space: then voxels are all that compares. A mask
     that states the defaults of files, under which it does not fit, has lost its place, which a warning says.
     """
-    mask = in_space(mask, volume.space) if mask.space and volume.space else mask
+    lost = (np.abs(mask.affine) == np.eye(4)).all()
+    mask = beside(mask, volume)
     stated = [bool(v.space or any(v.origin) or v.direction != IDENTITY) for v in (mask, volume)]
     if not all(stated) or mask.space != volume.space:
         return None
-    lost = (np.abs(mask.affine) == np.eye(4)).all()
-    if mask.space is None and (own := metres(mask.unit)) and (other := metres(volume.unit)):
-        spacing, origin = (triple(v * own / other for v in lengths) for lengths in (mask.spacing, mask.origin))
-        mask = replace(mask, spacing=spacing, origin=origin, unit=volume.unit)
     signs = np.rint(np.linalg.inv(mask.axes) @ volume.axes)
     across = np.abs(signs)
     if (across.sum(0) == 1).all() and (across.sum(1) == 1).all() and not isinstance(mask.data, Stored):
