@@ -215,6 +215,13 @@ def test_a_ply_keeps_values_in_columns_that_others_ignore(tmp_path: Path) -> Non
     refused(vvgt_library.DataError, "expected one that vvgt writes", read_ply, tmp_path / "c.ply")
 
 
+def test_units_of_any_letters_come_back(tmp_path: Path) -> None:
+    known = replace(facts(), unit="°C", quantity="température")
+    write_ply(tmp_path / "a.ply", cloud(), PlyOptions(live=known))
+    again = read_ply(tmp_path / "a.ply")[1].live
+    assert (again.unit, again.quantity) == ("°C", "température")
+
+
 def test_a_function_that_json_cannot_hold_is_sampled() -> None:
     bent = replace(RAMP, opacity_nodes=PiecewiseOpacity(np.array([0.0, HI]), np.array([0.0, 1.0]), np.full(2, 0.3)))
     body = json.loads(function_text(bent, LO, HI))

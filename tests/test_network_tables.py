@@ -39,12 +39,22 @@ def test_hilbert_visits_every_cell_once_and_never_jumps(bits):
     assert (np.abs(np.diff(cells[np.argsort(codes)], axis=0)).sum(axis=1) == 1).all()
 
 
+def test_a_part_is_ordered_as_the_whole():
+    """One centre beyond the unit frame widens the grid, of all parts."""
+    means = np.random.default_rng(0).uniform(-1, 1, (2000, 3)).astype(np.float32)
+    means[0] = 1.5
+    means = means[tb.canonical_order(means)]
+    codes = tb.interleave(tb.quantise(means[:1000], tb.bound(means)))
+    assert (np.diff(codes.astype(np.int64)) >= 0).all()
+    assert tb.bound(means[:1000]) < tb.bound(means) == 1.5
+
+
 @given(st.integers(1, 300), st.integers(0, 5), st.sampled_from([1, 3, 16]))
 def test_every_pool_at_least_halves_and_keeps_mean_positions(count, seed, coarse):
     means = scene(count, seed).means
     means = np.round(means * coarse).astype(np.float32) / coarse  # many share a place
     means = means[tb.canonical_order(means)]
-    stage = tb.StagePoints(tb.quantise(means), tb.BITS, means, np.ones(count, np.int64))
+    stage = tb.StagePoints(tb.quantise(means, tb.bound(means)), tb.BITS, means, np.ones(count, np.int64))
     whole = np.arange(count)
     for _ in range(4):
         after, parents = tb.pool(stage)

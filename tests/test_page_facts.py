@@ -189,6 +189,10 @@ def test_units_of_lengths_come_from_the_files(tmp_path: Path) -> None:
 def test_a_legend_is_read_back_and_drawn_by_its_nodes(tmp_path: Path) -> None:
     points = [{"x": 10, "rgb": [1, 0, 0], "opacity": 0}, {"x": 30, "rgb": [1, 0, 0], "opacity": 0.5}]
     points += [{"x": 30, "rgb": [0, 1, 0], "opacity": 1}, {"x": 90, "rgb": [0, 0, 1], "opacity": 1}]
+    lo, hi = 1e5 + 0.2, 1e5 + 0.8
+    near = [{"x": x, "rgb": [0, 0, 0], "opacity": 0.5} for x in (lo, 1e5 + 0.4, hi)]
+    far = json.loads(legend_text(read({"name": "t", "points": near}, "t"), lo, hi, "") or "")["nodes"]
+    np.testing.assert_allclose([node[0] for node in far], [lo, 1e5 + 0.4, hi], atol=1e-6)
     text = legend_text(read({"name": "t", "points": points}, "t"), 0.0, 60.0, "HU", "density")
     assert text is not None
     stream = io.BytesIO()

@@ -17,7 +17,7 @@ from PIL import Image
 from tests.test_live import COLORS, HI, LO, RAMP, WINDOW, cloud, facts
 from vvgt_cli.gaussians import PlyOptions
 from vvgt_cli.gaussians.formats.page_file import upright
-from vvgt_cli.gaussians.formats.page_look import html, nodes_of
+from vvgt_cli.gaussians.formats.page_look import html, look_entry, nodes_of
 from vvgt_cli.gaussians.formats.page_presets import Sketch, kind_of, presets_of
 from vvgt_cli.gaussians.formats.page_values import PageLayer, values_of
 from vvgt_cli.gaussians.formats.splats import splats_of
@@ -94,6 +94,11 @@ def test_the_page_says_where_the_volume_lies_and_how_it_looks() -> None:
     assert (layer["unit_distance"], layer["opacity_unit_distance"]) == (pytest.approx(0.05), 0.5)
     assert (layer["values"], layer["unit"], layer["labels"]) == ([LO, HI], "HU", [])
     np.testing.assert_allclose(look["box"], [[-0.2, -0.15, -0.1], [0.2, 0.15, 0.1]], atol=1e-9)
+    turned = Volume(np.zeros((2, 3, 4), np.uint8), direction=(0, 0, 1, 1, 0, 0, 0, 1, 0))  # i to y, j to z, k to x
+    held = values_of([PageLayer(turned, RAMP, 0.5)])
+    assert held is not None
+    box = look_entry(held._replace(look=facts()), options())["box"]
+    np.testing.assert_allclose(box, [[-0.1, -0.2, -0.15], [0.1, 0.2, 0.15]], atol=1e-9)  # of the world's axes
     for axis in range(3):  # a plane across an axis of the volume, where the viewer has it
         there = (up_matrix("y") @ np.eye(3)[axis]) * (-1, -1, 1)
         np.testing.assert_allclose(look["axes"][axis], there, atol=1e-12)

@@ -197,5 +197,8 @@ def test_the_page_of_one_volume_holds_its_values_and_look_unless_it_cannot(vvgt,
     assert {"look", "values"} <= set(scene("v.npy", "--light", "1,0,0", "--time-budget", "5"))
     assert not {"look", "values"} & set(scene("v.npy", "--no-values"))
     assert not {"look", "values"} & set(scene("rgb.npy", "--component", "color"))
+    for thin in ((128, 1, 128), (8, 1000, 8)):
+        np.save(tmp_path / "thin.npy", np.ones(thin, np.float32) * np.linspace(0, 1, thin[0])[:, None, None])
+        assert "look" in scene("thin.npy", "--tf", "viridis")
     np.save(tmp_path / "many.npy", np.arange(512, dtype=np.uint16).reshape(8, 8, 8))
     assert "look" not in scene("many.npy", "--labels", "auto")  # of so many labels

@@ -1,5 +1,6 @@
 """The closed form in blocks: the same Gaussians as in memory, the same bytes whatever the blocks, workers and order."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -209,6 +210,13 @@ def test_a_level_of_an_image_is_chosen_by_the_screen(vvgt, tmp_path):
         chosen = ["--level", level] if level else ["--blocks", "auto"]
         run = vvgt.ok("init", tmp_path / "v.zarr", "-o", tmp_path / "a.ply", "--screen", size, *options, *chosen)
         assert f": {grid} uint8" in run.err
+    zipfile = shutil.make_archive(str(tmp_path / "v.zarr"), "zip", tmp_path / "v.zarr")
+    for how in (("--level", "1"), ("--blocks", "auto", "--crop", "0:32,0:32,0:32")):
+        source = zipfile if "--level" in how else tmp_path / "v.zarr"
+        run = vvgt.ok("init", source, "-o", tmp_path / "a.ply", "--screen", 30, *options, *how)
+        assert ": 32 x 32 x 32 uint8" in run.err
+        step = np.abs(np.array(read_ply(tmp_path / "a.ply")[1].affine))[:3, :3].max()
+        assert step == (2 if "--level" in how else 1)  # a crop counts the finest voxels, as in memory
     run = vvgt.fails(2, "init", tmp_path / "v.zarr", "-o", tmp_path / "a.ply", *options, "--level", "3")
     assert "expected full, or 0 to 2" in run
     run = vvgt.fails(2, "init", "example:blob:20", "-o", tmp_path / "a.ply", *options, "--level", "1")

@@ -16,7 +16,7 @@ from tests.ramps import X, Y, Z, check_grid, ramp
 from tests.refused import refused
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume import ReadOptions, Volume, read_volume
-from vvgt_cli.volume.space import one_unit
+from vvgt_cli.volume.space import metres, one_unit
 
 COUNT = np.arange(120).reshape(4, 5, 6)  # z, y, x
 STEPS = 10.0 * np.arange(4)
@@ -413,6 +413,11 @@ def test_times_of_ome_zarr(tmp_path: Path) -> None:
     level = {"path": "0", "coordinateTransformations": [{"type": "scale", "scale": [2.5, 1, 1, 1]}]}
     group.attrs["multiscales"] = [{"version": "0.4", "axes": axes, "datasets": [level]}]
     assert read_volume(str(tmp_path / "v.zarr"), ReadOptions(time=1)).time == (2.5, "second")
+    assert read_volume(str(tmp_path / "v.zarr"), ReadOptions(component=1)).time == (2.5, "second")
+
+
+def test_milliseconds_are_no_lengths() -> None:
+    assert [metres(unit) for unit in ("ms", "MS", "meters", "Microns", "mm")] == [None, None, 1.0, 1e-6, 1e-3]
 
 
 def test_units_that_are_not_known_are_said(tmp_path: Path) -> None:

@@ -82,6 +82,12 @@ def test_the_origin_counts_in_pixels(tmp_path: Path, text: str) -> None:
     source = described(tmp_path / "a.tif", f"images=4\nslices=4\n{text}xorigin=3\nyorigin=-4\nzorigin=5\n", (4, 5, 1))
     volume = read_volume(source)
     np.testing.assert_allclose(volume.affine @ [3, -4, 5, 1], (0, 0, 0, 1), atol=1e-12)
+    (tmp_path / "slices").mkdir()
+    for k in range(2):
+        words = f"ImageJ=1.53c\n{text}xorigin=3\nyorigin=-4\nzorigin=5\n"
+        how: Any = {"photometric": "minisblack", "metadata": None, "resolution": (4, 5), "resolutionunit": 1}
+        tifffile.imwrite(tmp_path / "slices" / f"{k}.tif", VALUES[0, 0, 0].astype("u2"), description=words, **how)
+    assert read_volume(str(tmp_path / "slices")).origin == volume.origin
 
 
 def test_sizes_that_are_no_numbers(tmp_path: Path) -> None:

@@ -113,6 +113,16 @@ def test_interleaved_channels_of_a_lif_are_red_green_and_blue(tmp_path: Path) ->
     with pytest.raises(SeveralComponents) as caught:
         read_volume(str(tmp_path / "a.lif"))
     assert caught.value.color
+    content = microscopes.lif([("only", values)], interleaved=True)  # UTF-16
+    for channel, tag in enumerate("321"):
+        at = -1
+        for _ in range(channel + 1):
+            at = content.index('ChannelTag="'.encode("utf-16-le"), at + 1)
+        content = content[: at + 24] + tag.encode("utf-16-le") + content[at + 26 :]
+    (tmp_path / "b.lif").write_bytes(content)
+    for channel in range(3):  # blue is stored first
+        volume = read_volume(str(tmp_path / "b.lif"), ReadOptions(component=channel))
+        np.testing.assert_array_equal(volume.data, values[0, 2 - channel])
 
 
 def test_scenes_and_mosaics_of_a_czi(tmp_path: Path) -> None:

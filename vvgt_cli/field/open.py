@@ -279,6 +279,8 @@ def _at_level(read: ReadOptions, path: str, options: BlockOptions, size: int) ->
         return read, None
     if options.level is not None:
         return replace(read, level=0 if options.level == "full" else int(options.level)), None
+    if read.crop or read.mask is not None or read.spacing:  # of the finest voxels
+        return replace(read, level=0), None
     fits = [n for n, shape in enumerate(shapes) if shape and 2 / max(shape) <= MIN_CELL * pixel_width(size)]
     level = max(fits, default=0)
     sizes = " x ".join(map(str, reversed(shapes[level])))

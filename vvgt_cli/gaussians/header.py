@@ -338,8 +338,9 @@ def legend_text(tf: object, lo: float, hi: float, unit: str, quantity: str = "")
     if len(places) > MAX_LEGEND_NODES or tf.color_map.space != "RGB":
         places = np.linspace(lo, hi, MAX_LEGEND_NODES) if hi > lo else np.array([lo])
     nodes: list[list[Any]] = []
+    digits = 6 - math.floor(math.log10((hi / 2 - lo / 2) or abs(lo) or 1.0))  # six of the range
     for x, limits in zip(places.tolist(), tf.limits(places).tolist(), strict=True):
-        below, above = ([float(f"{x:.6g}"), round(opacity, 4), hex_color(rgb)] for opacity, *rgb in limits)
+        below, above = ([round(x, digits), round(opacity, 4), hex_color(rgb)] for opacity, *rgb in limits)
         nodes += [above] if x <= lo or below == above else [below] if x >= hi else [below, above]  # both at a step
     return json.dumps({"values": [lo, hi], "unit": unit, "quantity": quantity, "nodes": nodes})
 

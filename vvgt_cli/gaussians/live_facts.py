@@ -110,7 +110,7 @@ class LiveFacts:
             return [line for layer in self.layers for line in (layer.title(), *layer.lines())]
         dims = " ".join(map(str, self.dims))
         named = (("unit", self.unit), ("quantity", self.quantity))
-        unit = [f"comment vvgt live {word} {text}" for word, text in named if text]
+        unit = [f"comment vvgt live {w} {text if text.isascii() else json.dumps(text)}" for w, text in named if text]
         values = f"comment vvgt live values {self.lo!r} {self.hi!r} dims {dims}"
         if self.labels:
             return [values, *(f"comment vvgt live label {label.comment()}" for label in self.labels)]
@@ -170,7 +170,7 @@ def one_comment(text: str) -> dict[str, Any]:
             raise ValueError(text)
         return {"name": name, "distance": float(distance)}
     if word in ("unit", "quantity"):
-        return {word: text}
+        return {word: str(json.loads(text)) if text.startswith('"') else text}
     if word == "histogram":
         counts = tuple(int(count) for count in words)
         if len(counts) != BINS or min(counts) < 0:

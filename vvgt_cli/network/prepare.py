@@ -44,7 +44,7 @@ class Prepared:
     def part(self, start: int = 0, stop: int | None = None) -> dict[str, np.ndarray]:
         """Return the input of the geometry side for rows [start, stop): Gaussians, gradients and tables."""
         rows = self.rows[start:stop]
-        arrays = {"gaussians": rows, **tables.build(rows[:, :3], self.config.geometry)}
+        arrays = {"gaussians": rows, **tables.build(rows[:, :3], self.config.geometry, tables.bound(self.rows[:, :3]))}
         if self.gradients is not None:
             arrays["gradients"] = self.gradients[start:stop]
         return arrays
@@ -113,7 +113,7 @@ def prepare(
     order = tables.canonical_order(rows)
     views: dict[str, np.ndarray] = {}
     if config.has_images:
-        views = {**view_arrays(cameras), "images": image_arrays(gaussians, cameras, images, config)}
+        views = {**view_arrays(cameras), "images": image_arrays(gaussians, cameras, images, config, rule)}
     gradients = None
     if config.has_geometry and config.geometry.gradients:
         gradients = slope_rows(gaussians, cameras, images, rule)[order]
@@ -141,7 +141,7 @@ def view_arrays(cameras: Sequence[Camera]) -> dict[str, np.ndarray]:
 
 
 def image_arrays(
-    gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarray, config: NetworkConfig
+    gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarray, config: NetworkConfig, rule: Rule
 ) -> np.ndarray:
     """Return (n, channels, size, size) float32: targets, and for some networks the Gaussians' own rendering."""
     size = config.image.size
@@ -151,7 +151,7 @@ def image_arrays(
         if config.rendering:
             from vvgt_cli.splat import render
 
-            out[i, 4:] = resize(render(gaussians, camera), size)
+            out[i, 4:] = resize(render(gaussians, camera, rule), size)
     return out
 
 

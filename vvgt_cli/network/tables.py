@@ -44,9 +44,13 @@ def block_curves(config: GeometryConfig) -> list[list[str]]:
     return curves
 
 
-def quantise(means: np.ndarray) -> np.ndarray:
-    """Return cells (n, 3) int64 of the finest grid: 2^16 per axis over the cube around the unit frame and all means."""
-    bound = max(1.0, float(np.abs(means).max(initial=0)))
+def bound(means: np.ndarray) -> float:
+    """Return half the edge of the cube around the unit frame and all means (n, 3)."""
+    return max(1.0, float(np.abs(means).max(initial=0)))
+
+
+def quantise(means: np.ndarray, bound: float) -> np.ndarray:
+    """Return cells (n, 3) int64 of the finest grid: 2^16 per axis over the cube of half edge ``bound``."""
     cells = np.floor((means.astype(np.float64) / bound + 1) * (1 << BITS - 1)).astype(np.int64)
     return np.clip(cells, 0, (1 << BITS) - 1)
 
@@ -56,7 +60,7 @@ def canonical_order(rows: np.ndarray) -> np.ndarray:
 
     The result does not depend on the order of the rows (exact duplicates aside).
     """
-    codes = interleave(quantise(rows[:, :3]))
+    codes = interleave(quantise(rows[:, :3], bound(rows[:, :3])))
     order = np.argsort(codes, kind="stable")
     ordered = codes[order]
     tied = np.zeros(len(rows), bool)
@@ -131,18 +135,19 @@ def windows(order: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     return members, slots
 
 
-def build(means: np.ndarray, config: GeometryConfig) -> dict[str, np.ndarray]:
+def build(means: np.ndarray, config: GeometryConfig, bound: float = 1.0) -> dict[str, np.ndarray]:
     """Return all tables of a scene.
 
     Args:
         means: (K, 3) float32, already in `canonical_order`.
         config: of the geometry side.
+        bound: half the edge of the finest grid, `bound` of all rows that were ordered together.
 
     Returns:
         By name: ``positions`` (n, 3) float32 of the epipolar stage; ``parents_I`` (n_I,) into stage I + 1;
         ``neighbours_I`` (n_I, 27) for I from 1; ``windows_I_C`` and ``slots_I_C`` for each curve C that stage I uses.
     """
-    stage = StagePoints(quantise(means), BITS, means, np.ones(len(means), np.int64))
+    stage = StagePoints(quantise(means, bound), BITS, means, np.ones(len(means), np.int64))
     wanted: list[list[str]] = [[] for _ in range(STAGES)]
     stages = [*range(STAGES), *reversed(range(STAGES - 1))]  # of the nine groups of blocks
     for number, curves in zip(stages, block_curves(config), strict=True):

@@ -191,7 +191,7 @@ def labelled_volume(
     if field.ndim == 2:
         field, spatial = field[None], [Axis("", 1), *spatial]
     volume = _placed(field, spatial, (slope, intercept), options, source, name)
-    return _named(volume, attributes, dtype, _time(axes, options), source)
+    return _named(volume, attributes, dtype, _time(axes, index), source)
 
 
 def _warn_of_unread(axes: Sequence[Axis], attributes: Mapping[str, Any], options: ReadOptions, source: str) -> None:
@@ -329,10 +329,10 @@ def _packed(limit: float, slope: float, intercept: float) -> float:
     return round(stored) if math.isfinite(stored) and abs(stored - round(stored)) < 1e-3 else stored
 
 
-def _time(axes: Sequence[Axis], options: ReadOptions) -> tuple[float, str] | None:
-    """Return the coordinate along the axis of time, and its unit, None where there is none."""
-    stated = (a for a in axes if a.role == "t" and a.centres is not None and (options.time or 0) < a.size)
-    return next(((float(a.centres[options.time or 0]), a.units) for a in stated if a.centres is not None), None)
+def _time(axes: Sequence[Axis], index: Sequence[Any]) -> tuple[float, str] | None:
+    """Return the chosen coordinate along the axis of time, and its unit, None where there is none."""
+    stated = ((a, k) for a, k in zip(axes, index, strict=True) if a.role == "t" and not isinstance(k, slice))
+    return next(((float(a.centres[k]), a.units) for a, k in stated if a.centres is not None), None)
 
 
 def _named(
@@ -443,7 +443,7 @@ def _left(
 
     field: Any = Stored(read, kind, tuple(axes[k].size for k in zyx), [chunks[k] for k in zyx], source)
     volume = _placed(field, [axes[k] for k in zyx], _scaling(attributes, source), options, source, name)
-    return _named(volume, attributes, dtype, _time(axes, options), source)
+    return _named(volume, attributes, dtype, _time(axes, index), source)
 
 
 def _descends(a: Axis, source: str) -> bool:

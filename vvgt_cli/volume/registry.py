@@ -137,6 +137,8 @@ def level_shapes(source: str, options: ReadOptions) -> list[tuple[int, ...]]:
     """List the shapes (z, y, x) of a source's resolutions, finest first; none where there are none, or none is read."""
     path, shapes = Path(source), list[tuple[int, ...]]()
     if source.partition(":")[0] not in STEPPED:
+        path, options = _inner(source, options)
+        source = str(path)
         holding = (r for r in READERS if r.levels and r.holds is not None and r.holds(path))
         reader = next(holding, None) if path.is_dir() else None
         if path.is_file():

@@ -21,7 +21,7 @@ from vvgt_cli.errors import UsageError
 from vvgt_cli.files import atomic_write, check_disk_space
 from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.libraries import need
-from vvgt_cli.volume.space import in_space
+from vvgt_cli.volume.space import METRES, in_space, metres
 from vvgt_cli.volume.types import RIGHT, Volume
 
 SUFFIXES = (".nii.gz", ".nii", ".nrrd", ".mha", ".vti", ".npy", ".zarr", ".vdb")
@@ -197,9 +197,8 @@ def _write_zarr(folder: Path, name: str, planes: Planes) -> int:
     if np.abs(grid.axes - np.eye(3)).max() > RIGHT:
         raise UsageError(f"-o {name}: OME-Zarr states no directions, and this grid is turned; choose .nrrd or .nii.gz")
     shape, chunk = ((planes.components,) if several else ()) + grid.dims[::-1], (64,) * 3
-    unit = {"mm": "millimeter", "um": "micrometer", "nm": "nanometer", "m": "meter"}.get(
-        "mm" if grid.space else grid.unit
-    )
+    names = METRES.get(metres("mm" if grid.space else grid.unit) or 0.0, ())
+    unit = next((word for word in names if word.endswith("meter") or word == "angstrom"), None)
     axes: list[dict[str, str]] = [{"name": n, "type": "space"} | ({"unit": unit} if unit else {}) for n in "zyx"]
     scale, origin = list(grid.spacing[::-1]), list(grid.origin[::-1])
     if several:

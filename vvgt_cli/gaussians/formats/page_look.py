@@ -98,7 +98,7 @@ def look_entry(values: Values, options: PlyOptions) -> dict[str, Any]:
         warnings.warn("the page lights other looks by a headlight: its own rays know no sky", stacklevel=2)
     steps = options.story.steps if options.story else ()
     first, shown = values.facts[0], {str(step.get("function")) for step in steps}
-    half = np.linalg.norm(np.reshape(first["affine"], (3, 4))[:, :3], axis=0) * first["dims"] * scale / 2
+    half = np.abs(np.reshape(first["affine"], (3, 4))[:, :3] * first["dims"]).sum(axis=1) * scale / 2
     return {
         "layers": [
             _layer_entry(layer, scale, offered, shown)

@@ -28,6 +28,7 @@ FEW = 12  # nodes of presets for colours that are not interpolated linearly in R
 ALIKE = 0.01  # difference of opacity and colour up to which functions are the same
 EDGE, QUALITY = 84, 80  # px of a small picture; of its WebP
 CELLS, ENTRIES = 1 << 19, 1 << 12  # of the grid that it is drawn from; of a function's table
+THINNEST = 0.02  # of the longest edge: a sheet that is drawn
 STEP, STEPS = 0.6, 256  # of a cell's edge, between samples; and at most so many on a ray
 _HEADLIGHT = {key: getattr(MATTE, key) for key in ("ambient", "diffuse", "specular")}
 
@@ -218,7 +219,8 @@ class Sketch:
             values = np.add.reduceat(values, first, axis) / many
         known = np.isfinite(values)
         values = np.where(known, values, values[known].min() if known.any() else 0)
-        turned, size = (affine[:, :3] / spacing).T, size / size.max()  # the world's directions in the volume's axes
+        turned = (affine[:, :3] / spacing).T  # the world's directions in the volume's axes
+        size = np.maximum(size / size.max(), THINNEST)
         eye, up = turned @ _eye(space), turned @ np.array([0, 0, -1 if space and space[2] == "I" else 1])
         right = np.cross(up, eye) / np.linalg.norm(np.cross(up, eye))
         up, step = np.cross(eye, right), size / dims

@@ -139,6 +139,8 @@ def prepare_scenes(folder: Path, config: SceneConfig, console: Console) -> dict[
     make_scenes(folder, config, console, (0, 1))
     out: dict[str, list[TrainingScene]] = {}
     for part, wanted in recipes(folder, config).items():
+        if not wanted:
+            continue
         places = [folder / "scenes" / _key(recipe, config) for recipe in wanted]
         out[part] = [_load(place, config) for place in places if _about(place)["gaussians"] >= FEWEST]
         if not out[part]:

@@ -45,7 +45,8 @@ FORMATS = (
         lambda head: head.startswith(b"PK\x03\x04") and b".npy" in head[:512], ("array", "time"),
     ),
     Reader(
-        "zipped Zarr", (".zarr.zip", ".ozx"), lazy("arrays.remote.read_zipped"), is_zipped_zarr, _ALL, by_name=True
+        "zipped Zarr", (".zarr.zip", ".ozx"), lazy("arrays.remote.read_zipped"), is_zipped_zarr, _ALL, by_name=True,
+        levels=True,
     ),
     Reader(
         "GRIB", (".grib", ".grib1", ".grib2", ".grb", ".grb1", ".grb2"), lazy("vtk.child.volume_by_child", "GRIB"),

@@ -97,6 +97,9 @@ def read_dicom(path: Path, options: ReadOptions) -> Volume:
                 f"{path}: a segmentation (DICOM SEG) of {names_of(header)}; give its file, {file}, or the images that "
                 "it was made on"
             )
+        options.step(1, str(path))
+        if options.dims or rest:
+            raise UsageError(f"{path}: a segmentation, one volume on a grid of its own; leave out --dims and --array")
         return read_segmentation(path, options)
     number, _, name = rest.partition("/")
     name, stack = (name, int(number)) if number.isdecimal() else (rest, None)
@@ -316,7 +319,7 @@ def _tiles(mosaic: _Slice, n: int, stated: np.ndarray | None) -> Iterator[_Slice
         normal = -normal
     step = float(header.get("SpacingBetweenSlices") or header.get("SliceThickness") or 0)
     if step <= 0:
-        raise DataError(f"{mosaic.source}: a mosaic without SpacingBetweenSlices; expected it, or --spacing X Y Z")
+        raise DataError(f"{mosaic.source}: a mosaic without SpacingBetweenSlices; expected it")
     shift = (columns - columns / edge) / 2 * mosaic.spacing[0], (rows - rows / edge) / 2 * mosaic.spacing[1]
     first = mosaic.position + np.array(shift) @ mosaic.rows
     for k in range(n):
@@ -344,7 +347,7 @@ def _geometry(
     """
     first = slices[0]
     normal = np.cross(*first.rows)
-    if len(slices) == 1:
+    if len(slices) == 1 and options.dims is None:
         thickness = float(first.header.get("SliceThickness") or first.spacing[0])
         return options.spacing_or((*first.spacing, thickness)), _direction(first, normal), None
     positions = np.array([s.position for s in slices])

@@ -217,7 +217,7 @@ def read_analyze(path: Path, options: ReadOptions) -> Volume:
             raise DataError(f"{path}: an image without its .hdr beside it; expected a pair, or raw values with --dims")
         from vvgt_cli.volume.registry import read_volume
 
-        return read_volume(str(header), replace(options, crop=None, mask=None))  # which come later
+        return read_volume(str(header), replace(options, crop=None, mask=None, keep_largest=None))  # later
     head, _ = read_head(path, HEADER)
     parsed, place = _parse_analyze(head, str(path))
     volume = _volume(parsed, path, "raw", options)
@@ -225,7 +225,8 @@ def read_analyze(path: Path, options: ReadOptions) -> Volume:
         f"{path.name}: Analyze does not say which side is left; axes are taken as they are stored (a NIfTI file says)",
         stacklevel=2,
     )
-    origin = tuple(-(at - 1) * step if at else 0.0 for at, step in zip(place, volume.spacing, strict=True))
+    steps = [abs(step) for step in parsed.pixdim[1:4]]
+    origin = tuple(-(at - 1) * step if at else 0.0 for at, step in zip(place, steps, strict=True))
     return replace(volume, origin=origin)
 
 

@@ -71,6 +71,9 @@ def _picture(image: Any, path: Path) -> Micrograph:
     stored = stored.reshape((1,) * (len(axes) - len(shape)) + shape)
     values = np.transpose(stored, [axes.index(a) for a in ("T", "C", "S", "Z", "Y", "X")])
     times, channels, samples, nz, ny, nx = values.shape
+    stored_as = image.xml_element.findall("./Data/Image/ImageDescription/Channels/ChannelDescription")
+    if samples == 3 and [one.get("ChannelTag") for one in stored_as][:3] == ["3", "2", "1"]:  # blue, green, red
+        values = values[:, :, ::-1]
 
     def read(time: int, channel: int, box: Slices) -> np.ndarray:
         return values[time, channel // samples, channel % samples][box]

@@ -141,6 +141,7 @@ def _reader(
 
     def read(time: int, channel: int, box: Slices) -> np.ndarray:
         z, y, x = box
+        sample = channel % samples if samples != 3 else 2 - channel % samples  # NIS-Elements stores blue, green, red
         out = np.empty([k.stop - k.start for k in box], dtype)
         with turn, library_errors(str(path), "ND2"):
             for k in range(z.start, z.stop):
@@ -148,7 +149,7 @@ def _reader(
                 number = int(np.ravel_multi_index([at[a] for a in loops], [sizes[a] for a in loops])) if loops else 0
                 frame = np.asarray(opened().read_frame(number)) if packed is None else unpacked(number)
                 frame = frame.reshape(channels, ny, nx, samples)
-                out[k - z.start] = frame[channel // samples, y, x, channel % samples]
+                out[k - z.start] = frame[channel // samples, y, x, sample]
         return out
 
     return read

@@ -84,6 +84,7 @@ def read_slices(files: list[Path], options: ReadOptions, source: str, name: str)
         first = page(files[0], max(len(files), 2))
         plane, spacing, unit, read = first.data, first.spacing, first.unit, alike
         values = {"slope": first.slope, "intercept": first.intercept, "value_unit": first.value_unit}
+        values["origin"] = first.origin
     else:
         read = picture_planes(files, options, source)
         plane, spacing, unit = read(files[0]), options.spacing_or((1.0, 1.0, 1.0)), ""
@@ -153,7 +154,7 @@ def picture_planes(files: list[Path], options: ReadOptions, source: str) -> Call
 
     def plane(path: Path) -> np.ndarray:
         pixels = read_pixels(path) if count > 1 else _simplest(read_pixels(path))
-        pixels = np.repeat(pixels, count, axis=2) if pixels.shape[2] == 1 else pixels
+        pixels = np.repeat(pixels, 3, axis=2) if pixels.shape[2] == 1 and count == 3 else pixels
         if pixels.shape[2] < count or (count == 1 and pixels.shape[2] > 1):
             has = f"{path}: {pixels.shape[2]} components (colours, opacity)"
             raise DataError(f"{has}; expected {count} as in other pictures of {source}: convert it, or leave it out")

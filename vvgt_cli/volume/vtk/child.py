@@ -63,7 +63,7 @@ def read_indexed(path: Path, options: ReadOptions) -> Volume:
     from vvgt_cli.volume.registry import read_volume
 
     file, time = single
-    return read_volume(str(file), replace(options, time=time, crop=None, mask=None))
+    return read_volume(str(file), replace(options, time=time, crop=None, mask=None, keep_largest=None))
 
 
 def _single(index: Index, time: int | None, above: tuple[Path, ...] = ()) -> tuple[Path, int | None] | None:

@@ -66,8 +66,8 @@ export function worldOf(facts, enlarged = 1) {
 export const DIAGNOSIS = 'not for diagnosis';
 export const isMedical = ({ anatomical }, values) => anatomical || Boolean(values?.some?.(({ unit }) => unit === 'HU'));
 
-// A length or a coordinate as it is read
-export function shown(x, digits = 4) {
-  const text = String(Number(x.toPrecision(digits)));
+// A length, a coordinate or a value as it is read, with all digits before the point if it is `whole`
+export function shown(x, digits = 4, whole = false) {
+  const text = String(Number(x.toPrecision(whole ? Math.min(Math.max(String(Math.trunc(Math.abs(x))).length, digits), 15) : digits)));
   return text.replace('-', '−');
 }

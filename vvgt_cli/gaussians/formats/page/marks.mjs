@@ -101,7 +101,7 @@ export function marksOf(worldNow, changed, save) {
     },
     part: {
       key: 'marks',
-      get: () => (list.length ? encodeURIComponent(JSON.stringify(list.map(({ kind: of, places, text: said }) => [of, places.map((p) => p.map((x) => Number(x.toPrecision(7)))), ...(said ? [said] : [])]))) : ''),
+      get: () => (list.length ? encodeURIComponent(JSON.stringify(list.map(({ kind: of, places, text: said }) => [of, places.map((p) => p.map((x) => Number(x.toPrecision(9)))), ...(said ? [said] : [])]))) : ''),
       set(said) {
         const read = (said ? JSON.parse(said) : []).slice(0, MOST).map(([of, places, words = '']) => ({ kind: of, places, text: wordsOf(words) }));
         const whole = ({ kind: of, places }) => KINDS.includes(of) && places.length === POINTS[of] && places.every((p) => p.length === 3 && p.every(Number.isFinite));

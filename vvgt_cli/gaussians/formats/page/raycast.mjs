@@ -8,7 +8,7 @@ import { exposed, extinction, functionAt, TABLE, tableOf, WIDE } from './table.m
 const BLOCK = 8, ROWS = TABLE / WIDE;  // edge of what is skipped where it is empty; rows of a table
 const REST = 150, COARSE = 3, MOST = 32, QUIET = 2;  // ms without a change; part of the resolution; frames at most, and without a change
 const FAST = 60, SLOW = 200, THIN = 8;  // ms in which a band of a frame may be done, to be twice, or half as high; its least rows
-const HOLE = -65504;  // of what is unknown, which no value near it makes visible
+const HOLE = -65504, PART = 32;  // of what is unknown, which no value near it makes visible; of a step, in half precision: all others are far above it
 const cells = (dims) => dims.map((n) => Math.ceil(n / BLOCK));
 const STEEP = 2, BENT = 0.1;  // optical depth of a voxel by which extinction differs along a segment that is sampled finer while something moves; at rest
 const LOST = 'its graphics were lost', BACK = 5000;  // ms until which they may come back
@@ -179,18 +179,18 @@ function textureOf(gl, unit, target, internal, [nx, ny, nz]) {
 function uploaded(gl, grid, layer, k) {
   const { dims: [nx, ny, nz], codes, missing, lo, step, bits } = grid, [first, last] = layer.values, span = last - first || 1, labels = Boolean(grid.labels), room = gl.getParameter(gl.MAX_3D_TEXTURE_SIZE);
   if (Math.max(nx, ny, nz) > room) throw new Error(`it draws at most ${room} voxels along an axis`);
-  const whole = labels || (bits === 8 && !missing), byte = bits === 8, middle = Math.round(((first + last) / 2 - lo) / step) + missing;
+  const whole = labels || (bits === 8 && !missing), byte = bits === 8, middle = Math.round((grid.level - lo) / step) + missing;
   const [internal, format, type] = labels ? [byte ? gl.R8UI : gl.R16UI, gl.RED_INTEGER, byte ? gl.UNSIGNED_BYTE : gl.UNSIGNED_SHORT] : whole ? [gl.R8, gl.RED, gl.UNSIGNED_BYTE] : [gl.R16F, gl.RED, gl.FLOAT];
   const values = textureOf(gl, 2 + 2 * k, gl.TEXTURE_3D, internal, grid.dims), blocks = textureOf(gl, 3 + 2 * k, gl.TEXTURE_3D, gl.RG8, cells(grid.dims));
   gl.activeTexture(gl.TEXTURE2 + 2 * k);
-  for (let z = 0; z < nz; z++) {  // half precision is exact to 2048 on both sides of the middle
+  for (let z = 0; z < nz; z++) {  // half precision is exact to 2048 steps on both sides of the middle of most values
     const slice = codes.subarray(z * nx * ny, (z + 1) * nx * ny);
-    gl.texSubImage3D(gl.TEXTURE_3D, 0, 0, 0, z, nx, ny, 1, format, type, whole ? slice : Float32Array.from(slice, (code) => (code < missing ? HOLE : code - middle)));
+    gl.texSubImage3D(gl.TEXTURE_3D, 0, 0, 0, z, nx, ny, 1, format, type, whole ? slice : Float32Array.from(slice, (code) => (code < missing ? HOLE : (code - middle) / PART)));
   }
   const entry = (code) => Math.min(Math.max(((lo + step * (Math.max(code, missing) - missing) - first) / span) * (TABLE - 1), 0), TABLE - 1);
   return {
-    k, grid, layer, labels, one: whole ? 1 / 255 : 1, held: [values, blocks],
-    scale: labels ? [0, 0] : whole ? [(lo - first) / span, (255 * step) / span] : [(lo + step * (middle - missing) - first) / span, step / span],
+    k, grid, layer, labels, one: whole ? 1 / 255 : 1 / PART, held: [values, blocks],
+    scale: labels ? [0, 0] : whole ? [(lo - first) / span, (255 * step) / span] : [(lo + step * (middle - missing) - first) / span, (PART * step) / span],
     entries: labels ? [] : [less, more].map((pick, end) => Uint16Array.from(reduced(codes, grid.dims, pick), (code) => (end ? Math.ceil : Math.floor)(entry(code)))),
   };
 }

@@ -36,11 +36,11 @@ export function pickerOf(lens, worldNow, dataNow, look, picked) {
 }
 
 // The value at a place, in words; '' where it is unknown
-export const valueText = ({ value, in: of }) => (value === null ? '' : `${typeof value === 'string' ? value : shown(value, 4)}${of && ` ${of}`}`);
+export const valueText = ({ value, in: of }) => (value === null ? '' : `${typeof value === 'string' ? value : shown(value, 4, true)}${of && ` ${of}`}`);
 
 // A place in words: letters of the side where the space is one of the body
 export function placeText(place, { letters, anatomical, unit }) {
-  const digits = (x) => shown(x, Math.abs(x) < 100 ? 3 : 5), text = valueText(place);
+  const digits = (x) => shown(x, Math.abs(x) < 100 ? 3 : 5, true), text = valueText(place);
   const along = place.world.map((x, k) => (anatomical ? `${letters[k][x < 0 ? 0 : 1]} ${digits(Math.abs(x))}` : `${letters[k][1]} ${digits(x)}`));
   return `${along.join(', ')}${unit && ` ${unit}`}${text && `: ${text}${place.mean ? ` (${place.mean})` : ''}`}`;
 }

@@ -361,7 +361,7 @@ export function slicesOf(gridsOf, { world, cuts, rows, measures, moved, picked }
       get() {
         if (!base || root.hidden) return '';
         const seen = [body() ? 1 : 0, 1 + views.findIndex(({ name }) => name === large), zoom, ...(zoom > 1 ? way.toWorld(middle) : [])];
-        return [...(base.labels ? [0, 0] : window_), ...way.toWorld(at), face.getAttribute('aria-pressed') === 'true' ? 1 : 0, ...(seen.join() === '0,0,1' ? [] : seen)].map((x) => Number(x.toPrecision(6))).join(',');
+        return [...(base.labels ? [0, 0] : window_), ...way.toWorld(at), face.getAttribute('aria-pressed') === 'true' ? 1 : 0, ...(seen.join() === '0,0,1' ? [] : seen)].map((x) => Number(x.toPrecision(9))).join(',');
       },
       async set(text) {
         const numbers = text.split(',').map(Number), [upright = 0, alone = 0, times = 1, ...about] = numbers.slice(6);
