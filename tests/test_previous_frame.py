@@ -7,6 +7,7 @@ import struct
 from dataclasses import replace
 from pathlib import Path
 
+import nibabel
 import numpy as np
 import pytest
 
@@ -26,9 +27,12 @@ from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply
 from vvgt_cli.gaussians.formats.gsply_files import read_compressed_ply
 from vvgt_cli.gaussians.formats.page_file import patch, stored_frames
 from vvgt_cli.gaussians.formats.splats import splats_of
+from vvgt_cli.look import PiecewiseOpacity
+from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.refine import OptimizeOptions, optimize
 from vvgt_cli.splat import render
 from vvgt_cli.splat.reference import covariances
+from vvgt_cli.volume import Volume
 
 N = 40
 TF = {"points": [
@@ -315,3 +319,74 @@ def test_what_cannot_go_on_is_converted_frame_by_frame(vvgt, beat, more):
         "convert", beat / "v_*.npy", "--tf", beat / "tf.json", *replaced(HOW, *more), "-o", beat / "f_{}.ply"
     )
     assert ("differences " in done.err) == (more[0] == "--shard")
+
+
+def test_a_label_that_disappears_is_a_change(tmp_path):
+    one = np.zeros((N, N, N), np.uint8)
+    one[5:20, 5:35, 5:35] = 1
+    both = one.copy()
+    both[25:35, 10:30, 10:30] = 2
+    np.save(tmp_path / "one.npy", one)
+    np.save(tmp_path / "both.npy", both)
+    a, b = (load(SourceRequest(str(tmp_path / f"{name}.npy"), labels="auto")) for name in ("both", "one"))
+    assert changes(a, b).blocks.sum() == changes(b, a).blocks.sum() > 0
+
+
+def test_scalars_beside_a_layer_are_compared_as_alone(tmp_path):
+    """Between voxels, by data values, over the range of all frames."""
+    z, y, x = np.meshgrid(*[np.linspace(-1, 1, N)] * 3, indexing="ij")
+    values = np.where(np.sqrt(x**2 + y**2 + z**2) < 0.5, 100, 0).astype(np.float32)
+    layer = Volume(np.ones((N, N, N), np.uint8), name="layer")
+    nodes = PiecewiseOpacity(np.array([40.0, 50, 60]), np.array([0.0, 0.9, 0]))
+    band = replace(read({"name": "t", **TF}, "tf"), opacity_nodes=nodes)
+    pairs = (
+        (Volume(values), Volume(np.roll(values, 3, 2))),  # nothing at voxels is within the band
+        (Volume(values, slope=0.5), Volume(values, slope=0.7)),
+    )
+    for pair in pairs:
+        found = []
+        for layers in ((), (SourceRequest(layer, tf="gray"),)):
+            whole = load(SourceRequest(pair[0], tf=band)).statistics
+            a, b = (load(SourceRequest(one, tf=band, statistics=(whole,), layers=layers)) for one in pair)
+            found.append(changes(a, b).blocks)
+        assert found[0].any()
+        np.testing.assert_array_equal(*found)
+
+
+def test_what_fades_below_a_later_frames_range_is_a_change(tmp_path):
+    shell = {"points": [{"x": x, "rgb": [1, 0, 0], "opacity": o} for x, o in ((15, 0), (20, 0.1), (25, 0), (75, 0))]}
+    shell["points"].append({"x": 80, "rgb": [0, 0, 1], "opacity": 0.9})
+    (tmp_path / "two.json").write_text(json.dumps(shell))
+    first = np.full((N, N, N), 40, np.float32)
+    first[10:30, 10:30, 10:30] = 20
+    later = first.copy()
+    first[15:25, 15:25, 15:25], later[15:25, 15:25, 15:25] = 100, 50
+    whole = load(SourceRequest(Volume(first), tf=str(tmp_path / "two.json"))).statistics
+    a, b = (load(SourceRequest(Volume(v), tf=str(tmp_path / "two.json"), statistics=(whole,))) for v in (first, later))
+    assert changes(a, b).blocks.any()
+
+
+def test_frames_beneath_a_finer_layer_are_converted_by_themselves(vvgt, tmp_path):
+    for k, one in enumerate((body(0.2), body(0.3)[:, ::-1])):
+        np.save(tmp_path / f"v_{k}.npy", one)
+    (tmp_path / "tf.json").write_text(json.dumps(TF))
+    fine = nibabel.Nifti1Image(np.ones((4, 4, 4), np.uint8), np.diag([0.5, 0.5, 0.5, 1]))
+    nibabel.save(fine, tmp_path / "fine.nii")
+    how = ("--layer", f"{tmp_path / 'fine.nii'},labels=auto", *HOW[:-1], "4", "-o", tmp_path / "o_{}.ply")
+    vvgt.ok("convert", tmp_path / "v_*.npy", "--tf", tmp_path / "tf.json", *how)
+    first, second = (read_ply(tmp_path / f"o_{k}.ply")[0] for k in (0, 1))
+    assert first.means.shape != second.means.shape or not np.array_equal(first.means, second.means)
+
+
+def test_a_frame_without_any_visible_label_is_skipped(vvgt, tmp_path):
+    for k, number in enumerate((3, 1, 3)):
+        one = np.zeros((16, 16, 16), np.uint8)
+        one[4:12, 4:12, 4:12], one[0, 0, 0] = number, 5
+        np.save(tmp_path / f"lab{k}.npy", one)
+    table = {str(k): {"name": f"n{k}", "color": [1, 0, 0], "opacity": int(k == 3)} for k in (1, 3, 5)}
+    (tmp_path / "lab.json").write_text(json.dumps(table))
+    how = ("--labels", tmp_path / "lab.json", "--steps", 0, "--max-gaussians", 200, "--screen", 64)
+    done = vvgt.ok("convert", tmp_path / "lab*.npy", *how, "-o", tmp_path / "o_{}.ply")
+    assert "skipped: lab1.npy" in done.err
+    assert sorted(path.name for path in tmp_path.glob("o_*.ply")) == ["o_0.ply", "o_2.ply"]
+    assert json.loads((tmp_path / "o_index.json").read_text())["empty"] == [1]

@@ -13,7 +13,7 @@ from vvgt_cli.field.source import StyledVolume
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.frames import axes_of
 from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.volume import Volume
+from vvgt_cli.volume import Statistics, Volume
 from vvgt_cli.volume.stored import read_block
 
 EDGE = 4  # voxels along the edge of a block
@@ -91,20 +91,21 @@ def changes(before: StyledVolume, after: StyledVolume) -> Changes:
 def _slabs(before: StyledVolume, after: StyledVolume, reach: int) -> Iterator[tuple[int, int, np.ndarray]]:
     """Yield the first and last slice of each slab, and (z, y, x) bool, the voxels near a difference."""
     dims = after.volume.dims
+    ranges = [*after.series, *[after.overall] * len(after.layers)]  # of a frame's layers those of the whole series
     slab = max(AT_ONCE // (dims[0] * dims[1]) // EDGE, 1) * EDGE
     for z0 in range(0, dims[2], slab):
         z1 = min(z0 + slab, dims[2])
         low, high = max(z0 - reach - 1, 0), min(z1 + reach + 1, dims[2])
         changed = np.zeros((high - low, dims[1], dims[0]), bool)
-        for old, new in zip(before.layers, after.layers, strict=True):
+        for old, new, stats in zip(before.layers, after.layers, ranges, strict=False):
             if new.volume.dims == dims:  # layers on other grids are the same file in all frames
-                changed |= _differ(old, new, after, low, high)
+                changed |= _differ(old, new, stats, low, high)
         for _ in range(reach):
             changed = around(changed, np.maximum)
         yield z0, z1, changed[z0 - low : z1 - low]
 
 
-def _differ(old: Layer, new: Layer, source: StyledVolume, low: int, high: int) -> np.ndarray:
+def _differ(old: Layer, new: Layer, over: Statistics, low: int, high: int) -> np.ndarray:
     """Return (z, y, x) bool of slices ``low`` to ``high``: whether a layer looks different at or around a voxel."""
     if new.colors is not None:
         assert old.colors is not None
@@ -112,16 +113,16 @@ def _differ(old: Layer, new: Layer, source: StyledVolume, low: int, high: int) -
         return np.any([_slices(a, low, high) != _slices(b, low, high) for a, b in pairs], axis=0)
     first, second = (_slices(volume, low, high) for volume in (old.volume, new.volume))
     changed: np.ndarray
-    if source.gridded or not isinstance(new.tf, TransferFunction):  # optics at voxels
+    if not isinstance(new.tf, TransferFunction):  # labels: optics at voxels
         changed = first != second
         looks = [
-            np.column_stack([new.tf.color(x), new.tf.opacity(x)])
-            for x in (_data(old.volume, first[changed]), _data(new.volume, second[changed]))
+            np.column_stack([layer.tf.color(x), layer.tf.opacity(x)])
+            for layer, x in ((old, _data(old.volume, first[changed])), (new, _data(new.volume, second[changed])))
         ]
         visible = (looks[0][:, 3] > 0) | (looks[1][:, 3] > 0)
         changed[changed] = visible & (looks[0] != looks[1]).any(axis=1)
         return changed
-    lo, hi = source.statistics.lo, source.statistics.hi
+    lo, hi = over.lo, over.hi
     a, b = _data(old.volume, first), _data(new.volume, second)
     same: np.ndarray = (a == b) | (np.abs(a - b) <= SAME * (hi - lo)) | (np.isnan(a) & np.isnan(b))
     if not same.all():

@@ -173,7 +173,8 @@ class Clouds(Mapping[str, Result]):
         shown = []
         for cloud in self.clouds:
             other = cloud.recolor(look, **how)
-            shown.append(replace(cloud, gaussians=other.gaussians, report=other.report, ply=other.ply, directions=None))
+            made = {"gaussians": other.gaussians, "report": other.report, "ply": other.ply}
+            shown.append(replace(cloud, **made, directions=None, held=None))  # whose look is the old one
         return replace(self, clouds=shown)
 
     def _page(self, path: str, story: StoryLike | None, overwrite: bool, how: dict[str, Any]) -> int:

@@ -20,6 +20,7 @@ from vvgt_cli.conversion.resume import Checkpoint, checkpoint_folder
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.field.blocked import Blocked
 from vvgt_cli.field.field import Field
+from vvgt_cli.files import is_stream
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.formats import format_of, is_page
 from vvgt_cli.gaussians.formats.streamed import folder_of
@@ -124,7 +125,7 @@ def write_beside(run: Run, request: ConvertRequest, conversion: Conversion) -> N
     """Report what the file's format costs, and write preview and report."""
     from vvgt_cli.images import captioned, write_png
 
-    if format_of(str(request.output)):
+    if format_of(str(request.output)) and not is_stream(str(request.output)):
         source = conversion.field.source
         run.compile(source.kernels(EVALUATE), source.kernel_type())
         read_back(run, str(request.output), conversion.gaussians, conversion.ply, conversion.field)

@@ -34,7 +34,7 @@ from vvgt_cli.conversion.manifest import Manifest, Shard, parse_shard
 from vvgt_cli.conversion.merge import write_shard
 from vvgt_cli.conversion.place import to_frame_of
 from vvgt_cli.conversion.request import ConvertRequest
-from vvgt_cli.errors import DataError, SeveralSteps, UsageError
+from vvgt_cli.errors import DataError, NothingVisible, SeveralSteps, UsageError
 from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.files import claim
 from vvgt_cli.gaussians.formats import format_of, is_page
@@ -208,7 +208,14 @@ def _run(batch: Batch, files: Files | None, console: Console) -> Clouds:
         for item in batch.items(run, lambda stem: files is None or files.wants(batch, stem)):
             alone = replace(item.request, output=None, report=None, preview=None)
             request = alone if files is None else files.request(batch, item)
-            conversion = convert_one(request, run.console, warm=batch.previous, finished=item.gaussians)
+            try:
+                conversion = convert_one(request, run.console, warm=batch.previous, finished=item.gaussians)
+            except NothingVisible:
+                if batch.kind != FRAMES:
+                    raise
+                run.console.progress(f"skipped: {item.name} (nothing of it is visible)")
+                batch.facts["empty"] = sorted({*batch.facts["empty"], item.facts["frame"]})
+                continue
             if conversion.report.interrupted:
                 raise KeyboardInterrupt
             facts = {**item.facts, **(batch.previous.facts() if batch.previous else {})}

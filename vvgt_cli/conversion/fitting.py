@@ -95,7 +95,7 @@ def fit(
     elif warm is None:
         field.views.expect(_pictures(plan.stages, work.fit))
     check_memory(plan, *(() if warm is None else warm.memory(plan, work.fit)))
-    work.checkpoint = checkpoint_of(request.checkpoint, field, work.fit)
+    work.checkpoint = checkpoint_of(request.checkpoint, field, work.fit, work.degree)
     if finished is not None:
         work.gaussians = as_stored(finished)
     elif kept := work.checkpoint.load(FITTED):

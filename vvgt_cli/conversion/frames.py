@@ -18,7 +18,7 @@ from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import DataError, SeveralComponents, UsageError
 from vvgt_cli.field.digests import digest, volume_digest
 from vvgt_cli.field.layered import ALL, OpenedFile, functions_of, open_content
-from vvgt_cli.field.open import automatic
+from vvgt_cli.field.open import automatic, layer_facts
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.files import read_text
 from vvgt_cli.gaussians.formats import is_page
@@ -192,7 +192,7 @@ class FrameSeries(Batch):
             "volume": survey.content,
             "frames": survey.count,
             "function": digest(*looks),
-            **({"layers": [repr(layer) for layer in request.source.layers]} if request.source.layers else {}),
+            **({"layers": list(map(layer_facts, request.source.layers))} if request.source.layers else {}),
             "opacity_unit_distance": self._distance,
             **({} if lighting is None else {"light": lighting.key()}),
             **({"live": True} if request.live else {}),
@@ -201,7 +201,8 @@ class FrameSeries(Batch):
             **({"story": list(request.story.steps)} if request.story else {}),
             **asdict(request.fit),
             "model": read_text(find_model(request.fit.model) / CARD) if request.fit.model else None,
-            **{key: ply[key] for key in ("frame", "sh_degree", "comments")},
+            **{key: ply[key] for key in ("frame", "sh_degree", "comments", "camera")},
+            "level": request.blocks and request.blocks.level,
             "up": up_axis(request.up, request.ply.frame, grid.space),
             "place": [grid.space, *grid.affine[:3].ravel().tolist()],
             "outputs": [os.path.relpath(p, folder) for p in (request.output, request.report, request.preview) if p],

@@ -173,10 +173,12 @@ def write_file(
     values: Values | None,
 ) -> int:  # fmt: skip
     """Write a file and return its bytes; if that fails, save a `.ply` elsewhere, since the run may have taken hours."""
+    known = format_of(output)
     if is_stream(output):
         with open(output, "ab") as stream:
-            return write_ply(stream, gaussians, options, normals)
-    known = format_of(output)
+            if known is None:
+                return write_ply(stream, gaussians, options, normals)
+            return stream.write(encoded(known, gaussians, options, output, values))
     try:
         with atomic_write(output, overwrite) as temporary:
             if known is None:

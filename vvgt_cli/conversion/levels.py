@@ -66,6 +66,8 @@ def write_levels(
     task = WrittenFiles(stored, parts, folder, axes, SCALE, replace(options, sh_degree=cut.plan.degree))
     with run.stage(stage) as record, atomic_write(target, overwrite) as temporary:
         task.forget_changed()
+        if stage == "write":
+            target.unlink(missing_ok=True)  # of another run, whose files are replaced
         run_pass(task, stage)
         spreads = stored.field("spreads")
         facts = _levels(task, counts, spreads, errors, choices)

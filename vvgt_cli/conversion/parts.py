@@ -135,7 +135,7 @@ def make_parts(
         DataError: a block is damaged.
     """
     parts = cut.parts(float(thresholds[0, 0]))
-    steps: Any = None if refiner is None else (refiner.fit, refiner.distances)
+    steps: Any = None if refiner is None else (refiner.fit, refiner.distances, refiner.early)
     key = digest(cut.key, thresholds, steps, parts, least)[:16]
     kind = f"{'closed' if refiner is None else 'refined'}-{key}"
     task = PartTask(cut, parts, thresholds, least, kind, refiner)

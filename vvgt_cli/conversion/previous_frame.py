@@ -96,7 +96,8 @@ class PreviousFrame(WarmStart):
         self._moved = None
         last, self._last = self._last, None
         lighting = work.field.source.lighting
-        if last is None or (lighting is not None and lighting.sky is not None):  # shadows reach far
+        finer = work.field.source.layers[0].volume.dims != work.field.source.volume.dims  # for a layer's sake
+        if last is None or finer or (lighting is not None and lighting.sky is not None):  # shadows reach far
             self._pictures.invalidate(None)
             return ""
         with work.run.stage("differences") as stage:

@@ -104,7 +104,7 @@ def checkpoint_folder(folder: str | None) -> Iterator[None]:
             Path(folder).rmdir()  # fails where it is not empty
 
 
-def checkpoint_of(folder: str | None, field: Field, fit: FitOptions) -> Checkpoint:
+def checkpoint_of(folder: str | None, field: Field, fit: FitOptions, degree: int) -> Checkpoint:
     """Return a conversion's checkpoint, keyed by all that it depends on; raise DataError if its model is unreadable."""
     if folder is None:
         return Checkpoint()
@@ -116,6 +116,7 @@ def checkpoint_of(folder: str | None, field: Field, fit: FitOptions) -> Checkpoi
         "opacity_unit_distance": source.unit_distance,
         "light": None if source.lighting is None else source.lighting.key(),
         **asdict(fit),
+        "degree": degree,
         "model": read_text(find_model(fit.model) / CARD) if fit.model else None,
     }
     return Checkpoint(Path(folder), digest(json.dumps(depends, sort_keys=True)))

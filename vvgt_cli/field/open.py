@@ -379,19 +379,24 @@ def _settings(request: SourceRequest, needs: FieldNeeds) -> dict[str, Any]:
     text = Path(tf).read_text("utf-8", "replace") if isinstance(tf, str) and os.path.isfile(tf) else repr(tf)
     return {
         "version": [VERSION, LAYOUT],
-        "volume": _facts(request.volume),
-        "files": [_facts(path) for path in request.paths()],
+        "volume": facts_of(request.volume),
+        "files": [facts_of(path) for path in request.paths()],
         "read": {key: repr(value) for key, value in asdict(request.read).items() if value is not None},
         "function": [text, request.tf_range, request.unit_distance],
-        "look": [repr(request.light), _facts(request.labels), *(repr(layer) for layer in request.layers)],
-        "skies": [_facts(light) for light in request.light.lights if light.lower().endswith(PICTURES)],
+        "look": [repr(request.light), facts_of(request.labels), *map(layer_facts, request.layers)],
+        "skies": [facts_of(light) for light in request.light.lights if light.lower().endswith(PICTURES)],
         "series": digest(*request.statistics),
         "gaussians": [needs.gaussians, needs.degree, needs.on_disk, needs.values],
         "size": needs.size,
     }
 
 
-def _facts(volume: Any) -> list[Any]:
+def layer_facts(layer: SourceRequest) -> list[Any]:
+    """Return everything that the look of a layer depends on."""
+    return [repr(layer), *map(facts_of, (layer.volume, layer.tf, layer.labels))]
+
+
+def facts_of(volume: Any) -> list[Any]:
     """Return a file's name, size and time, or a digest of anything else."""
     if not isinstance(volume, str):
         volumes = content_of(volume).volumes if isinstance(volume, Volume | OpenedFile) else ()

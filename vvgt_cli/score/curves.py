@@ -19,7 +19,7 @@ from vvgt_cli.errors import DataError
 
 Run = dict[str, Any]
 FORMATS = ("vvgt-report", "vvgt-conversion")
-SCORING = ("test views", "conditions", "certificate")  # stages that only measure, or write measurements
+SCORING = ("test views", "live look", "conditions", "certificate")  # stages that only measure, or write measurements
 KINDS = ("closed form", "network", "steps", "baseline", "live", "peer")
 STAGES = {  # colours of known stages, in order
     "read": "#8a949e", "scene": "#b4bbc2", "samples": "#8f7bbf", "closed form": "#2f7fbf", "check views": "#f2c76b",
@@ -178,7 +178,7 @@ def _check(run: Run) -> None:
 
 def _named(document: dict[str, Any]) -> Run:
     options = document["options"]
-    steps = options.get("steps") or 0
+    steps = (document.get("refinement") or {}).get("steps") or 0
     budget = options.get("max_gaussians") or document["gaussians"]
     name = f"{document['command']}, K {short(budget)}" + (f", {steps} steps" if steps else "")
     return document | {"name": name, "kind": "steps" if steps else "closed form"}
