@@ -15,6 +15,7 @@ import pytest
 from tests.headers import uncertified
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians import read_ply
+from vvgt_cli.gaussians.formats import read_splats
 
 INIT = "init example:blob:8 --max-gaussians 20 --screen 32"
 FULL = os.strerror(errno.ENOSPC)
@@ -118,3 +119,10 @@ def test_nothing_but_the_output_need_be_writable(tmp_path):
     done = shell(line, Path("/proc"), HOME="/proc", TMPDIR="/proc", XDG_CACHE_HOME="/proc")
     assert (done.returncode, done.stderr) == (0, "")
     assert len(read_ply(tmp_path / "a.ply")[0])
+
+
+def test_a_format_goes_to_a_fifo_as_it_is(head):
+    line = f"mkfifo out.spz; cat out.spz > b.spz & timeout 300 small convert head.npy --tf tf.json {MAKE} -o out.spz"
+    done = shell(f"small convert head.npy --tf tf.json {MAKE} -o a.spz; {line} && wait", head)
+    assert done.returncode == 0, done.stderr
+    assert len(read_splats(head / "b.spz")[0]) == len(read_splats(head / "a.spz")[0])

@@ -457,6 +457,9 @@ def test_a_fourth_channel_in_json_is_opacity(tmp_path: Path) -> None:
         table(tmp_path, '{"1": [255, 0, 0, 51], "2": {"color": [0, 0, 1, 1], "opacity": 0.5}}', "a.json")
     )
     assert [e.opacity for e in found.labels] == [0.2, 0.5]
+    listed = '[{"id": 1, "r": 255, "g": 0, "b": 0, "a": 51}, {"id": 2, "color": [0, 255, 0], "alpha": 102}]'
+    found = read_labels(table(tmp_path, listed, "b.json"))
+    assert [(e.color, e.opacity) for e in found.labels] == [((1, 0, 0), 0.2), ((0, 1, 0), 0.4)]
 
 
 def test_regions_are_groups_and_dataset_json_is_offered(vvgt, tmp_path: Path) -> None:

@@ -205,6 +205,13 @@ def test_what_cannot_be_is_said_in_one_line(lights, options, message):
     assert message in str(error.value)
 
 
+def test_directions_stay_to_the_bit_however_often_they_are_written():
+    for seed in range(200):
+        x, y, z = np.random.default_rng(seed).normal(size=3)
+        once = lighting(f"{x},{y},{z}")
+        assert parse_lighting(once.text()) == once
+
+
 @pytest.mark.parametrize("name", LIGHTS)
 def test_a_header_line_gives_the_light_back(name):
     assert parse_lighting(LIGHTS[name].text()) == LIGHTS[name]

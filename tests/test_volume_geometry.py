@@ -406,6 +406,35 @@ def test_transformations_of_ome_zarr_that_are_not_read_are_refused(tmp_path: Pat
     assert read_volume(store, ReadOptions(spacing=(1, 2, 3))).spacing == (1, 2, 3)
 
 
+def test_images_of_ome_zarr_in_groups_of_their_own(tmp_path: Path) -> None:
+    """As ngff-zarr writes them: scale0/image."""
+    group = zarr.open_group(str(tmp_path / "v.zarr"), mode="w", zarr_format=2)
+    axes = [{"name": name, "type": "space", "unit": "micrometer"} for name in "zyx"]
+    levels = []
+    for k in range(2):
+        group.create_array(f"scale{k}/image", data=COUNT[:: k + 1, :: k + 1, :: k + 1])
+        steps = [{"type": "scale", "scale": [2 * (k + 1), 0.5 * (k + 1), 0.25 * (k + 1)]}]
+        levels.append({"path": f"scale{k}/image", "coordinateTransformations": steps})
+    image = {"version": "0.4", "axes": axes, "datasets": levels, "coordinateTransformations": None}
+    group.attrs["multiscales"] = [image]
+    for k in range(2):
+        volume = read_volume(str(tmp_path / "v.zarr"), ReadOptions(level=k))
+        assert (volume.spacing, volume.unit) == ((0.25 * (k + 1), 0.5 * (k + 1), 2.0 * (k + 1)), "um")
+
+
+@pytest.mark.parametrize("place", ["z", "y"])
+def test_an_axis_of_one_value_stays_beside_channels(tmp_path: Path, place: str) -> None:
+    values = COUNT[:1] if place == "z" else COUNT[:, :1]
+    group = zarr.open_group(str(tmp_path / "v.zarr"), mode="w", zarr_format=2)
+    group.create_array("0", data=np.stack([values, values + 1]))
+    axes = [{"name": "c", "type": "channel"}, *({"name": n, "type": "space"} for n in "zyx")]
+    level = {"path": "0", "coordinateTransformations": [{"type": "scale", "scale": [1, 2, 0.5, 0.25]}]}
+    group.attrs["multiscales"] = [{"version": "0.4", "axes": axes, "datasets": [level]}]
+    volume = read_volume(str(tmp_path / "v.zarr"), ReadOptions(component=1))
+    assert volume.spacing == (0.25, 0.5, 2.0)
+    np.testing.assert_array_equal(volume.data, values + 1)
+
+
 def test_times_of_ome_zarr(tmp_path: Path) -> None:
     group = zarr.open_group(str(tmp_path / "v.zarr"), mode="w", zarr_format=2)
     group.create_array("0", data=np.stack([COUNT, COUNT + 1]))

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from tests.refused import refused
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume import ReadOptions, read_volume
+from vvgt_cli.volume.blocks import Packed
 from vvgt_cli.volume.headers import DTYPES
 from vvgt_cli.volume.options import parse_dtype
 from vvgt_cli.volume.plain import raw as raw_module
@@ -83,6 +84,10 @@ def test_gzipped_raw(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_volume(str(path)).data, values)
     path.write_bytes(gzip.compress(values.tobytes()[:-1]))
     refused(DataError, "hold 47 bytes, its header declares 48 bytes", read_volume, str(path))
+    path.write_bytes(gzip.compress(values.tobytes() + b"x"))
+    refused(DataError, "hold more than 48 bytes; check --dims and --dtype", read_volume, str(path))
+    slabs = Packed(path, np.dtype("<u2"), (2, 3, 4), "gzip", (0, 0), True)
+    refused(DataError, "hold more than 48 bytes", lambda: slabs[0:2])
 
 
 @pytest.mark.parametrize("size", [47, 49, 1])

@@ -16,7 +16,7 @@ import pytest
 import vvgt_cli
 from tests.refused import refused
 from tests.test_scale import bodies
-from vvgt_cli.errors import DataError
+from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume import ReadOptions, read_volume
 from vvgt_cli.volume.arrays.remote import Remote
 from vvgt_cli.volume.registry import level_shapes
@@ -95,6 +95,11 @@ def test_answers_without_an_end_are_a_line(vvgt, address, folder, monkeypatch, e
     done = vvgt("info", f"{address}/{place[0]}", *place[1:])
     assert (done.code, "\n" in done.error.strip()) == (1, False), done.error
     assert f"{end}: more than the " in done.error
+
+
+def test_options_of_raw_files_are_refused(address: str) -> None:
+    options = ReadOptions(dtype="float32", byte_order="big")
+    refused(UsageError, "leave out --dtype", read_volume, f"{address}/x.ome.zarr", options)
 
 
 def test_two_colons_are_part_of_a_name(address: str, folder: Path) -> None:

@@ -194,6 +194,19 @@ def test_plot3d_with_functions(tmp_path: Path) -> None:
     refused(DataError, "coordinates alone; expected values beside them", read_volume, str(path))
 
 
+def test_flat_pieces_are_joined(tmp_path: Path) -> None:
+    for k in range(2):
+        piece = pv.ImageData(dimensions=(5, 5, 1), origin=(4 * k, 0, 0))
+        piece.point_data["v"] = np.full(25, k + 1.0)
+        piece.save(tmp_path / f"p{k}.vti")
+    rows = "".join(f'<DataSet index="{k}" file="p{k}.vti"/>' for k in range(2))
+    text = f'<VTKFile type="vtkMultiBlockDataSet"><vtkMultiBlockDataSet>{rows}</vtkMultiBlockDataSet></VTKFile>'
+    (tmp_path / "v.vtm").write_text(text)
+    volume = read_volume(str(tmp_path / "v.vtm"), ReadOptions(dims=(9, 5, 1)))
+    assert volume.dims == (9, 5, 1)
+    assert set(np.asarray(volume.data)[0, 2, [0, -1]]) == {1.0, 2.0}
+
+
 def test_hidden_cells_are_nan(tmp_path: Path) -> None:
     for k, block in enumerate((files.hexahedra(0, 2), files.image(2, 4))):
         marks = np.zeros(block.n_cells, np.uint8)

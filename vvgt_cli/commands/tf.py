@@ -68,7 +68,8 @@ def show(
 def convert(tf: str, output: str, form: str, tf_range: str, overwrite: bool, console: Console) -> None:
     """Convert the transfer function IN (any supported format, or the name of a colour map) to the JSON file OUT.
 
-    Features that the format cannot store are an error. OUT may be - for standard output.
+    Features that the format cannot store are an error, unit distance and light a message. OUT may be - for
+    standard output.
 
     Examples:
       vvgt tf convert CT-Bone.vp bone.json

@@ -296,7 +296,11 @@ def _record(one: Any, what: str) -> tuple[str, Any]:
     fields = {key: next((lower[k] for k in keys if lower.get(k) is not None), None) for key, keys in COLUMNS.items()}
     if not _INTEGER.fullmatch(str(fields["number"])):
         raise DataError(f"{what}: {str(one)[:40]!r}, without a number; {EXPECTED}")
-    entry = {key: fields[key] for key in ("name", "color") if fields[key] is not None}
+    channels = [fields[key] for key in "rgb" if fields[key] is not None]
+    color = fields["color"] if fields["color"] is not None else channels or None
+    if isinstance(color, list) and len(color) == 3 and fields["a"] is not None:
+        color = [*color, fields["a"]]
+    entry = {key: value for key, value in (("name", fields["name"]), ("color", color)) if value is not None}
     return str(fields["number"]), {key: lower[key] for key in ("opacity", "parents", "visible") if key in lower} | entry
 
 

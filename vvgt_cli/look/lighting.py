@@ -17,6 +17,7 @@ AMBIENT, DIFFUSE, SPECULAR, POWER = 0.1, 0.7, 0.2, 10.0  # vtkVolumeProperty's
 COEFFICIENTS = ("ambient", "diffuse", "specular", "specular_power")
 HEADLIGHT, NONE = "headlight", "none"
 MAX_LIGHT = 1000.0  # of a coefficient: a highlight with a larger power is a point
+UNIT = 1e-12  # from 1: of a direction that is a unit vector, which stays as it is stated
 AXES = {axis: tuple(float(letter == axis) for letter in "xyz") for axis in "xyz"}
 SUN = "sun"
 SKIES = ("studio", "overcast", "window", SUN)  # light from all around, traced along paths
@@ -189,6 +190,8 @@ def _direction(light: str, space: str | None) -> Direction:
     if not 0 < largest < math.inf:
         raise UsageError(f"--light {light}: its length is {'0' if largest == 0 else 'not finite'}; {EXPECTED}")
     length = largest * math.hypot(x / largest, y / largest, z / largest)
+    if abs(length - 1) < UNIT:
+        return x, y, z
     return x / length, y / length, z / length
 
 

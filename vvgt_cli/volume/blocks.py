@@ -124,7 +124,7 @@ def load_block(
     ``dtype`` is with its byte order, ``shape`` slowest first. -1 as ``offset`` means that the block ends the file (raw
     only); ``skip`` counts decompressed bytes. ``encoding`` is ``raw`` (memory-mapped, read-only), ``gzip``, ``zlib``,
     ``bzip2`` or ``text``. ``packed``: slices are read front to back, so that a large compressed block of three axes may
-    stay in its file. ``alone``: a message says of bytes behind a raw block, which the file should not hold.
+    stay in its file. ``alone``: a message says of bytes behind a raw block, and a packed one with more is refused.
 
     Returns:
         `np.memmap` for ``raw``, else an array in memory, or `Packed`.
@@ -156,8 +156,8 @@ def load_block(
             f"{size_text(need + skip)} that its header declares; check the header's sizes and type"
         )
     if packed and len(shape) == 3 and is_large(need):
-        return cast(np.ndarray, Packed(path, dtype, shape, encoding, (offset, skip)))
-    return _decompressed(path, dtype, shape, offset, encoding, skip)
+        return cast(np.ndarray, Packed(path, dtype, shape, encoding, (offset, skip), alone))
+    return _decompressed(path, dtype, shape, offset, encoding, skip, alone)
 
 
 def _too_short(path: Path, size: int, shape: tuple[int, ...], dtype: np.dtype, offset: int) -> DataError:
@@ -172,7 +172,7 @@ def _too_short(path: Path, size: int, shape: tuple[int, ...], dtype: np.dtype, o
 
 
 def _decompressed(
-    path: Path, dtype: np.dtype, shape: tuple[int, ...], offset: int, encoding: str, skip: int
+    path: Path, dtype: np.dtype, shape: tuple[int, ...], offset: int, encoding: str, skip: int, alone: bool
 ) -> np.ndarray:
     need = count(shape) * dtype.itemsize
     check_memory(need, path.name)
@@ -182,16 +182,21 @@ def _decompressed(
             stream = _OPENERS[encoding](file)
             _discard(stream, skip)
             out, filled = fill(stream, need)
-            if filled == need:
-                stream.read(1)  # reaches the trailer, and with it the checksum
+            more = filled == need and stream.read(1)  # reaches the trailer, and with it the checksum
         except (OSError, EOFError, zlib.error) as error:
             raise _damaged(path, encoding, error) from error
+    if alone and more:
+        raise _longer(path, encoding, need + skip)
     if filled < need:
         raise DataError(
             f"{path.name}: its {encoding} data hold {size_text(filled + skip)}, its header declares "
             f"{size_text(need + skip)}; check the header's sizes and type"
         )
     return out.view(dtype).reshape(shape)
+
+
+def _longer(path: Path, encoding: str, need: int) -> DataError:
+    return DataError(f"{path.name}: its {encoding} data hold more than {size_text(need)}; check --dims and --dtype")
 
 
 def _damaged(path: Path, encoding: str, error: Exception) -> DataError:
@@ -206,8 +211,11 @@ class Packed:
 
     ndim = 3
 
-    def __init__(self, path: Path, dtype: np.dtype, shape: tuple[int, ...], encoding: str, start: tuple[int, int]):
+    def __init__(
+        self, path: Path, dtype: np.dtype, shape: tuple[int, ...], encoding: str, start: tuple[int, int], alone: bool
+    ):
         """Describe the block that `load_block` would read; ``start`` are its ``offset`` and ``skip``."""
+        self._alone = alone
         self.path, self.dtype, self.shape, self.encoding, self.start = path, dtype, shape, encoding, start
         self.size = count(shape)
         self.nbytes = self.size * dtype.itemsize
@@ -225,10 +233,11 @@ class Packed:
                 self._open()
             _discard(self._stream, (first - self._next) * slice_bytes)
             out, filled = fill(self._stream, need)
-            if filled == need and last == self.shape[0]:
-                self._stream.read(1)  # reaches the trailer, and with it the checksum
+            more = filled == need and last == self.shape[0] and self._stream.read(1)  # the trailer, with the checksum
         except (OSError, EOFError, zlib.error) as error:
             raise _damaged(self.path, self.encoding, error) from error
+        if self._alone and more:
+            raise _longer(self.path, self.encoding, self.nbytes + sum(self.start))
         if filled < need:
             raise DataError(
                 f"{self.path.name}: its {self.encoding} data end in slice {first + filled // slice_bytes} of "

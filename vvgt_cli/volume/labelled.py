@@ -203,8 +203,9 @@ def _warn_of_unread(axes: Sequence[Axis], attributes: Mapping[str, Any], options
 
 def _split_axes(axes: list[Axis], options: ReadOptions, source: str) -> tuple[list[int], int | None, int | None]:
     """Return the indices of the spatial axes, of the axis of components and of the axis of time."""
-    left = list(range(len(axes)))
-    for k in [k for k in left if axes[k].size == 1]:  # of time steps and the like there may be one
+    left, roles = list(range(len(axes))), [a.role for a in axes]
+    alone = [a.role in ("x", "y", "z") and roles.count(a.role) == 1 for a in axes]
+    for k in [k for k in left if axes[k].size == 1 and not alone[k]]:  # of time steps and the like there may be one
         if len(left) > 3 or (len(left) == 3 and axes[k].role in ("t", "c")):
             left.remove(k)
     listing = ", ".join(map(str, axes)) or "none"

@@ -151,6 +151,8 @@ def read_scheme(scheme: str, rest: str, options: ReadOptions) -> Volume:
         head, inner = url, ""
     if inner and options.array is not None:
         raise UsageError(f"{url}: --array {options.array} and :/{inner} choose both; leave out one")
+    if flags := [flag for flag in options.raw_flags if flag != "--dims"]:
+        raise UsageError(f"{url}: Zarr, which states its own layout; leave out {' '.join(flags)}")
     place = cast(Path, Remote(_Server(url), head.rstrip("/")))
     if not holds_zarr(place):
         raise DataError(

@@ -46,7 +46,8 @@ def read_zarr(path: Path, options: ReadOptions) -> Volume:
     array = _array(zarr, place)
     attributes = _marked(array)
     names = facts.get("dimension_names") or attributes.get("_ARRAY_DIMENSIONS") or [""] * array.ndim
-    axes = _ome_axes(place, array.shape, options.spacing is not None) or [
+    group = _group_of(path, place)
+    axes = _ome_axes(group, place, array.shape, options.spacing is not None) or [
         axis(str(name or ""), size) for name, size in zip(names, array.shape, strict=True)
     ]
     beside = _beside(zarr, path, place, [a.name for a in axes if a.centres is None])
@@ -57,7 +58,7 @@ def read_zarr(path: Path, options: ReadOptions) -> Volume:
         lambda index: np.asarray(array[index]), array.dtype, axes, attributes, options, str(place),
         name_in(path, place), array.chunks,
     )  # fmt: skip
-    if (labels := _ome(place.parent).get("image-label")) is None:
+    if (labels := _ome(group).get("image-label")) is None:
         return volume
     return replace(volume, segments=segments_in(lambda: _segments(labels), str(place)))
 
@@ -240,7 +241,14 @@ def _multiscale(group: Path) -> dict[str, Any]:
     return {}
 
 
-def _ome_axes(place: Path, shape: tuple[int, ...], spacing_given: bool) -> list[Axis]:
+def _group_of(path: Path, place: Path) -> Path:
+    """Return the group of OME-Zarr that an array is in, which may be above one of its own (``scale0/image``)."""
+    above = place.parent
+    nested = len(place.relative_to(path).parts) > 1
+    return above.parent if nested and not _multiscale(above) and _multiscale(above.parent) else above
+
+
+def _ome_axes(group: Path, place: Path, shape: tuple[int, ...], spacing_given: bool) -> list[Axis]:
     """Return the axes of a level of an OME-Zarr image; none where the array is not one.
 
     Images of versions before 0.3 state no axes: they are t, c, z, y, x.
@@ -249,8 +257,8 @@ def _ome_axes(place: Path, shape: tuple[int, ...], spacing_given: bool) -> list[
         DataError: axes that do not fit the array.
         UsageError: a transformation of another kind, and no spacing given.
     """
-    image = _multiscale(place.parent)
-    level = next((d for d in image.get("datasets", []) if str(d.get("path")) == place.name), None)
+    image = _multiscale(group)
+    level = next((d for d in image.get("datasets", []) if str(group / str(d.get("path"))) == str(place)), None)
     if level is None:
         return []
     described = image.get("axes") or list("tczyx")
@@ -260,7 +268,7 @@ def _ome_axes(place: Path, shape: tuple[int, ...], spacing_given: bool) -> list[
             f"{len(described)} ({'as its metadata list' if image.get('axes') else 't, c, z, y, x'})"
         )
     scale, shift = np.ones(len(shape)), np.zeros(len(shape))
-    for step in [*level.get("coordinateTransformations", []), *image.get("coordinateTransformations", [])]:
+    for step in [step for of in (level, image) for step in of.get("coordinateTransformations") or []]:
         kind = step.get("type", "identity")
         if not spacing_given and kind != "identity" and (kind not in step or kind not in ("scale", "translation")):
             raise UsageError(
@@ -278,7 +286,7 @@ def _ome_axes(place: Path, shape: tuple[int, ...], spacing_given: bool) -> list[
         unit = str(facts.get("unit", "") or "")
         placed = role not in ("t", "c") or (role == "t" and unit)
         centres = shift[k] + scale[k] * np.arange(size) if placed else None
-        labels, colors = _rendering(place.parent, size) if role == "c" else ((), ())
+        labels, colors = _rendering(group, size) if role == "c" else ((), ())
         axes.append(Axis(name, size, centres, unit, role, labels, colors, abs(float(scale[k]))))
     return axes
 

@@ -104,7 +104,8 @@ def read_raw(path: Path, options: ReadOptions) -> Volume:
     if encoding == "raw" and size != need:
         raise _mismatch(str(path), f"the file has {size_text(size)}", dims, dtype, options.header_bytes)
     packed = options.packed and options.component is None
-    data = load_block(path, dtype, dims[::-1], encoding=encoding, skip=options.header_bytes, packed=packed)
+    skip = options.header_bytes
+    data = load_block(path, dtype, dims[::-1], encoding=encoding, skip=skip, packed=packed, alone=True)
     if isinstance(data, Packed):
         return Volume(data, spacing=options.spacing_or((1.0, 1.0, 1.0)), name=volume_name(path))
     return _volume(data, volume_name(path), str(path), options)

@@ -88,8 +88,9 @@ def volume_of(leaves: Sequence[Leaf], options: ReadOptions, source: str, name: s
         raise DataError(f"{source}: no dataset in it; expected an image, a grid or a mesh")
     for leaf in leaves:
         check_cells(leaf.data, source)
-    filled = (leaf for leaf in leaves if leaf.data.GetNumberOfCells() > 0 and not leaf.data.IsA("vtkPolyData"))
-    deep = [leaf for leaf in filled if leaf.data.GetMaxSpatialDimension() == 3]
+    filled = [leaf for leaf in leaves if leaf.data.GetNumberOfCells() > 0 and not leaf.data.IsA("vtkPolyData")]
+    most = max((leaf.data.GetMaxSpatialDimension() for leaf in filled), default=0)
+    deep = [leaf for leaf in filled if leaf.data.GetMaxSpatialDimension() == most]
     chosen = deep if deep and len(leaves) > 1 else leaves[:1]
     if chosen[0].data.IsA("vtkPolyData"):
         raise DataError(f"{source}: a surface (vtkPolyData); expected cells that fill a volume")
