@@ -15,6 +15,7 @@ import numpy as np
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.checks import Case, Figure, require
 from vvgt_cli.closed_form import VbmOptions, backproject, initialise
+from vvgt_cli.closed_form.fit import BRIGHTEST
 from vvgt_cli.conversion.gaussian_files import open_gaussians
 from vvgt_cli.dvr import RenderSettings, Scene, render_view, render_view_reference, render_views
 from vvgt_cli.dvr.layers import Layer, grid_of
@@ -173,7 +174,8 @@ def require_in_range(gaussians: Gaussians, scene: Scene, budget: int) -> None:
     opacity = gaussians.opacity
     require(opacity.max() <= 0.9901, f"opacity {opacity.max():.6g}")
     require(gaussians.colors.min() >= -1e-6, f"colour {gaussians.colors.min():.3g}")
-    require(gaussians.colors.max() <= 1 + 1e-6, f"colour {gaussians.colors.max():.3g}")
+    brightest = 1.0 if scene.light is None else BRIGHTEST
+    require(gaussians.colors.max() <= brightest + 1e-6, f"colour {gaussians.colors.max():.3g}")
     beyond = (np.abs(gaussians.means) - scene.half * (1 + 1e-6)).max()
     require(beyond <= 0, f"a centre {beyond:.3g} outside the box")
     require(gaussians.log_scales.max() < 1, f"a scale of {np.exp(float(gaussians.log_scales.max())):.3g}")

@@ -251,7 +251,7 @@ class Blocked(Field):
         voxels alone.
         """
         if self.grid is None or self.source.mixed:
-            return list(range(len(self._grid(np.zeros(3, np.int64)).blocks)))
+            return list(range(len((self.grid or self._grid(np.zeros(3, np.int64))).blocks)))
         store = self.run_pass.store
         return [n for n in range(len(self.grid.blocks)) if len(store.load(CELLS, n, names=("counts",))["counts"])]
 

@@ -6,7 +6,7 @@ import os
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -204,10 +204,15 @@ def _resolved(request: SourceRequest, options: BlockOptions, size: int) -> tuple
     if path == "-" or (os.path.exists(path) and not (os.path.isfile(path) or os.path.isdir(path))):
         raise UsageError(f"{path}: a pipe, which can only be read once; expected a file to read in blocks")
     absolute = _absolute(path)
-    layers = tuple(
-        replace(layer, volume=_absolute(layer.volume)) if isinstance(layer.volume, str) else layer
-        for layer in request.layers
-    )
+
+    def at_level(layer: SourceRequest) -> SourceRequest:
+        if not isinstance(layer.volume, str):
+            return layer
+        file = _absolute(layer.volume)
+        read = layer.read if options.level is not None else _at_level(layer.read, file, options, size)[0]
+        return replace(layer, volume=file, read=read)
+
+    layers = tuple(map(at_level, request.layers))
     read, message = _at_level(request.read, absolute, options, size)
     if isinstance(read.mask, str):
         read = replace(read, mask=str(Path(read.mask).absolute()))
@@ -358,7 +363,7 @@ def needs_histogram(request: SourceRequest) -> bool:
 
     if request.tf is None:
         return True
-    given = [request.tf, *(layer.tf for layer in request.layers if layer.labels is None)]
+    given = [request.tf, *(layer.tf for layer in request.layers if layer.labels in (None, NO_LABELS))]
     functions = [read_transfer_function(tf) if isinstance(tf, str) else tf for tf in given]
     return any(tf is None or tf.of_histogram for tf in functions)
 
@@ -376,12 +381,12 @@ def runner_of(options: BlockOptions, threads: int) -> Runner:
 def _settings(request: SourceRequest, needs: FieldNeeds) -> dict[str, Any]:
     """Return everything that stored blocks depend on."""
     tf = request.tf
-    text = Path(tf).read_text("utf-8", "replace") if isinstance(tf, str) and os.path.isfile(tf) else repr(tf)
+    text = Path(tf).read_text("utf-8", "replace") if isinstance(tf, str) and os.path.isfile(tf) else digest(tf)
     return {
         "version": [VERSION, LAYOUT],
         "volume": facts_of(request.volume),
         "files": [facts_of(path) for path in request.paths()],
-        "read": {key: repr(value) for key, value in asdict(request.read).items() if value is not None},
+        "read": {one.name: digest(getattr(request.read, one.name)) for one in fields(request.read)},
         "function": [text, request.tf_range, request.unit_distance],
         "look": [repr(request.light), facts_of(request.labels), *map(layer_facts, request.layers)],
         "skies": [facts_of(light) for light in request.light.lights if light.lower().endswith(PICTURES)],
@@ -393,14 +398,14 @@ def _settings(request: SourceRequest, needs: FieldNeeds) -> dict[str, Any]:
 
 def layer_facts(layer: SourceRequest) -> list[Any]:
     """Return everything that the look of a layer depends on."""
-    return [repr(layer), *map(facts_of, (layer.volume, layer.tf, layer.labels))]
+    return [digest(replace(layer, volume="")), *map(facts_of, (layer.volume, layer.tf, layer.labels))]
 
 
 def facts_of(volume: Any) -> list[Any]:
     """Return a file's name, size and time, or a digest of anything else."""
     if not isinstance(volume, str):
         volumes = content_of(volume).volumes if isinstance(volume, Volume | OpenedFile) else ()
-        return [digest(*(one.data for one in volumes)) if volumes else repr(volume)]
+        return [digest(*volumes) if volumes else digest(volume)]
     outer = [name for name in (volume, volume.rpartition(":/")[0], volume.partition("#")[0]) if name]
     files = next((some for name in outer if (some := stored_files(name))), [])
     whole = [inner for file in files for inner in (file.rglob("*") if file.is_dir() else (file,))]

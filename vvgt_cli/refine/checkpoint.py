@@ -91,7 +91,7 @@ class Checks:
 
 def fingerprint(gaussians: Gaussians, options: OptimizeOptions, *views: Any, others: Iterable[np.ndarray] = ()) -> str:
     """Hash all that a run depends on; ``views``: `Train`, `Check` or None, ``others``: weights and which are free."""
-    digest = hashlib.sha256(f"{STEPPED} {replace(options, checkpoint=None)!r}".encode())
+    digest = hashlib.sha256(f"{STEPPED} {replace(options, checkpoint=None, device='cpu')!r}".encode())
     for array in (*gaussians.arrays().values(), *others):
         digest.update(array.tobytes())
     for part in filter(None, views):

@@ -47,7 +47,7 @@ class OptimizeOptions:
         early: steps after which the run ends where no difference is seen any more (`UNSEEN`), which is decided halfway
             there; None: it does not.
         patience: scores in a row without a gain of 0.01 dB, in the second half, after which to stop.
-        checkpoint: .npz written every ``check_every`` steps and at the end; where it is there, the run goes on from it.
+        checkpoint: .npz written after scores, or 30 s, and at the end; where it is there, the run goes on from it.
         seed: of the order of views, and of what "3dgs" draws.
         device: "cpu", or "cuda" for steps of the method "axes" there (`vvgt_cli.refine.on_device`).
     """

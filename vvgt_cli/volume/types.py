@@ -62,7 +62,7 @@ class UnitFrame:
     centre: tuple[float, float, float]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Volume:
     """A scalar volume.
 

@@ -106,7 +106,7 @@ class OutOfCore(Stage):
         if not steps and fit.model is None:
             return None
         if fit.device != "cpu":
-            run.console.message("steps on parts are taken on the CPU: their pixels have weights, which a GPU ignores")
+            run.console.message("steps on parts are taken on the CPU")
         run.compile(for_degree(OPTIMIZE, work.degree))
         plain = replace(fit, steps=steps, device="cpu", time_budget=None, max_megabytes=None)
         return Refiner(field.reader, field.light, plain, early_end(fit))
