@@ -86,6 +86,14 @@ def test_stages_that_cut_the_pyramid_again_have_it(more, folder, vvgt, monkeypat
     assert (folder / "a.ply").read_bytes() == (folder / "whole.ply").read_bytes()
 
 
+def test_what_is_kept_of_another_degree_is_another_conversion(folder, vvgt, monkeypatch):
+    line = (*LINE, "--light", "headlight", "--checkpoint", "kept", "-o", "a.ply")
+    with monkeypatch.context() as patch:
+        ended(patch, "scores.score_test_views", 0)
+        assert vvgt(*line).code == 130
+    assert "belongs to another volume or other options" in vvgt.fails(2, *line, "--sh-degree", "0")
+
+
 def test_what_is_kept_of_another_conversion_or_is_damaged(folder, vvgt, monkeypatch):
     line = (*LINE, "-o", "a.ply", "--checkpoint", "kept")
     with monkeypatch.context() as patch:

@@ -42,7 +42,7 @@ def test_a_layer_without_labels_has_its_histogram(layers: list[str], tmp_path: P
     how = {"size": 40, "background": (0, 0, 0)}
     look = vvgt.Look(tf, layers=[layer])
     for name, blocks in (("a", None), ("b", 16)):
-        vvgt.render(one, look, output=tmp_path / name, orbit=1, blocks=blocks, **how)
+        vvgt.render(one, tmp_path / name, look=look, orbit=1, blocks=blocks, **how)
     a, b = (read_png(next((tmp_path / name).glob("*.png"))) for name in "ab")
     np.testing.assert_allclose(a, b, atol=0.01)
 

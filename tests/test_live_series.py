@@ -44,7 +44,9 @@ def test_a_series_in_python_is_live(frames, tmp_path) -> None:
     assert [cloud.ply.live for cloud in blocked.values()] == [cloud.ply.live for cloud in clouds.values()]
     other = clouds.recolor("magma")
     other.save(tmp_path / "m.html")
-    assert len(scene_of((tmp_path / "m.html").read_bytes())["frames"]) == 3
+    scene = scene_of((tmp_path / "m.html").read_bytes())
+    assert len(scene["frames"]) == 3
+    assert "look" not in scene  # of the conversion, which is another one
 
 
 @pytest.mark.parametrize("labelled", [False, True])

@@ -107,6 +107,19 @@ def test_the_finest_level_is_the_closed_form_four_times_as_large(vvgt, volume: P
     assert np.mean(np.array(apart) < 2e-3) > 0.97
 
 
+def test_levels_whose_replacement_ends_early_have_no_manifest(vvgt, volume, folder, tmp_path, monkeypatch) -> None:
+    """It would name files of both."""
+    shutil.copytree(folder, tmp_path / "out")
+
+    def end(self, number):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(WrittenFiles, "__call__", end)
+    command = replaced(("init", volume, *FIT, "-o", tmp_path / "out" / "lod-meta.json"), "--screen", "200")
+    assert vvgt(*command, "--overwrite").code == 130
+    assert not (tmp_path / "out" / "lod-meta.json").exists()
+
+
 @pytest.mark.parametrize(("rule", "steps"), [("inria", "0"), ("playcanvas", "8")])
 def test_errors_are_those_of_what_is_in_the_files(vvgt, volume, folder: Path, tmp_path: Path, rule, steps) -> None:
     if rule != "inria":
