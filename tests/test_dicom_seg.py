@@ -176,7 +176,7 @@ def test_what_is_no_label_map_is_refused_in_a_line(tmp_path: Path, monkeypatch) 
     refused(DataError, r"expected a table of labels", read_labels, str(tmp_path / "ct" / "0.dcm"))
     write_seg(tmp_path / "s.dcm", files, organs())
     refused(UsageError, "on a grid of its own", read_volume, str(tmp_path / "s.dcm"), ReadOptions(dims=(3, 3, 3)))
-    refused(UsageError, "expected", read_volume, str(tmp_path / "s.dcm"), ReadOptions(time=7))
+    refused(UsageError, "has 1 time step", read_volume, str(tmp_path / "s.dcm"), ReadOptions(time=7))
     whole = (tmp_path / "s.dcm").read_bytes()
     for size in (300, 1000, len(whole) // 2, len(whole) - 9):
         (tmp_path / "cut.dcm").write_bytes(whole[:size])

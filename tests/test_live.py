@@ -216,10 +216,11 @@ def test_a_ply_keeps_values_in_columns_that_others_ignore(tmp_path: Path) -> Non
 
 
 def test_units_of_any_letters_come_back(tmp_path: Path) -> None:
-    known = replace(facts(), unit="°C", quantity="température")
-    write_ply(tmp_path / "a.ply", cloud(), PlyOptions(live=known))
-    again = read_ply(tmp_path / "a.ply")[1].live
-    assert (again.unit, again.quantity) == ("°C", "température")
+    for unit, quantity in (("°C", "température"), ('"', '"Density" field')):
+        known = replace(facts(), unit=unit, quantity=quantity)
+        write_ply(tmp_path / "a.ply", cloud(), PlyOptions(live=known))
+        again = read_ply(tmp_path / "a.ply")[1].live
+        assert (again.unit, again.quantity) == (unit, quantity)
 
 
 def test_a_function_that_json_cannot_hold_is_sampled() -> None:

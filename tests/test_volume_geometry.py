@@ -435,6 +435,13 @@ def test_an_axis_of_one_value_stays_beside_channels(tmp_path: Path, place: str) 
     np.testing.assert_array_equal(volume.data, values + 1)
 
 
+def test_more_axes_of_one_value_than_are_needed(tmp_path: Path) -> None:
+    group = zarr.open_group(str(tmp_path / "v.zarr"), mode="w", zarr_format=2)
+    array = group.create_array("v", data=np.arange(120).reshape(4, 1, 5, 6).astype(np.uint8))
+    array.attrs["_ARRAY_DIMENSIONS"] = ["section", "z", "y", "x"]
+    assert read_volume(f"{tmp_path / 'v.zarr'}/v").dims == (6, 5, 4)
+
+
 def test_times_of_ome_zarr(tmp_path: Path) -> None:
     group = zarr.open_group(str(tmp_path / "v.zarr"), mode="w", zarr_format=2)
     group.create_array("0", data=np.stack([COUNT, COUNT + 1]))
@@ -446,7 +453,7 @@ def test_times_of_ome_zarr(tmp_path: Path) -> None:
 
 
 def test_milliseconds_are_no_lengths() -> None:
-    assert [metres(unit) for unit in ("ms", "MS", "meters", "Microns", "mm")] == [None, None, 1.0, 1e-6, 1e-3]
+    assert [metres(unit) for unit in ("ms", "MS", "meters", "Microns", "mms")] == [None, None, 1.0, 1e-6, 1e-3]
 
 
 def test_units_that_are_not_known_are_said(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ COLUMNS = ("value", "spread", "length", "axis_x", "axis_y", "axis_z")
 NXYZ, LABEL, LAYER = ("nx", "ny", "nz"), "label", "layer"
 VALUES, LABEL_ROW, LAYER_ID = slice(0, 6), 9, 10  # columns of `Gaussians.live`
 AXIS, GRADIENT = slice(3, 6), slice(6, 9)  # the same; the gradient is stored as the normal in a file
+QUOTE = '"'  # begins a unit or quantity that is written as JSON
 SAMPLED = 64  # nodes of a function that cannot be stored exactly
 MAX_LABELS = 500  # that fit in a header
 MAX_FUNCTION = 12_000  # characters: some loaders read only the first 10 KB of a header
@@ -110,7 +111,8 @@ class LiveFacts:
             return [line for layer in self.layers for line in (layer.title(), *layer.lines())]
         dims = " ".join(map(str, self.dims))
         named = (("unit", self.unit), ("quantity", self.quantity))
-        unit = [f"comment vvgt live {w} {text if text.isascii() else json.dumps(text)}" for w, text in named if text]
+        texts = ((word, text if text.isascii() and text[0] != QUOTE else json.dumps(text)) for word, text in named if text)
+        unit = [f"comment vvgt live {word} {text}" for word, text in texts]
         values = f"comment vvgt live values {self.lo!r} {self.hi!r} dims {dims}"
         if self.labels:
             return [values, *(f"comment vvgt live label {label.comment()}" for label in self.labels)]
@@ -170,7 +172,7 @@ def one_comment(text: str) -> dict[str, Any]:
             raise ValueError(text)
         return {"name": name, "distance": float(distance)}
     if word in ("unit", "quantity"):
-        return {word: str(json.loads(text)) if text.startswith('"') else text}
+        return {word: str(json.loads(text)) if text[:1] == QUOTE else text}
     if word == "histogram":
         counts = tuple(int(count) for count in words)
         if len(counts) != BINS or min(counts) < 0:

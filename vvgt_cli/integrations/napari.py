@@ -47,7 +47,8 @@ def write(path: str, layers: Sequence[tuple[Any, dict[str, Any], str]]) -> list[
     if not shown:
         raise UsageError("no visible layer; show one of those that are saved")
     steps = max(len(_values(layer)) if _values(layer).ndim == 4 else 1 for layer in shown)
-    if len({(len(_values(x)), x.scale[0], x.translate[0]) for x in shown if _values(x).ndim == 4}) > 1:
+    timed = [layer for layer in shown if _values(layer).ndim == 4 and len(_values(layer)) > 1]
+    if len({(len(_values(layer)), layer.scale[0], layer.translate[0]) for layer in timed}) > 1:
         raise UsageError("layers whose time axes differ; expected the same steps of all, or save them one by one")
     lost = [f"{layer.name}: {', '.join(notes)}" for layer in shown if (notes := _lost(layer, len(shown) > 1))]
     said = [f"not taken from the layers: {'; '.join(lost)}"] if lost else []

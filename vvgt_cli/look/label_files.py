@@ -280,7 +280,12 @@ def table_of(parsed: Any, what: str, pick: str = "") -> LabelTable:
     if isinstance(parsed, list):
         if pick:
             raise DataError(f"{what}: holds one table; omit #{pick}")
-        return _table(_entries([_record(one, what) for one in parsed], what), what)
+        records = [_record(one, what) for one in parsed]
+        alphas = [entry.pop("alpha") for _, entry in records]
+        for alpha, (_, entry) in zip(alphas, records, strict=True):
+            if alpha is not None and any(alphas):  # FreeSurfer's are all 0
+                entry.setdefault("opacity", min(alpha / 255 if alpha > 1 else alpha, 1))
+        return _table(_entries(records, what), what)
     if not isinstance(parsed, dict):
         raise DataError(f"{what}: JSON that is no object; {EXPECTED}")
     nested = all(one and isinstance(one, dict) and not _INTEGER.fullmatch(key) for key, one in parsed.items())
@@ -296,11 +301,11 @@ def _record(one: Any, what: str) -> tuple[str, Any]:
     fields = {key: next((lower[k] for k in keys if lower.get(k) is not None), None) for key, keys in COLUMNS.items()}
     if not _INTEGER.fullmatch(str(fields["number"])):
         raise DataError(f"{what}: {str(one)[:40]!r}, without a number; {EXPECTED}")
-    channels = [fields[key] for key in "rgb" if fields[key] is not None]
-    color = fields["color"] if fields["color"] is not None else channels or None
-    if isinstance(color, list) and len(color) == 3 and fields["a"] is not None:
-        color = [*color, fields["a"]]
+    color = fields["color"]
+    if color is None and all(isinstance(fields[key], int | float) for key in "rgb"):
+        color = [fields[key] for key in "rgb"]
     entry = {key: value for key, value in (("name", fields["name"]), ("color", color)) if value is not None}
+    entry["alpha"] = fields["a"] if isinstance(fields["a"], int | float) else None
     return str(fields["number"]), {key: lower[key] for key in ("opacity", "parents", "visible") if key in lower} | entry
 
 

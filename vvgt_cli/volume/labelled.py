@@ -208,6 +208,9 @@ def _split_axes(axes: list[Axis], options: ReadOptions, source: str) -> tuple[li
     for k in [k for k in left if axes[k].size == 1 and not alone[k]]:  # of time steps and the like there may be one
         if len(left) > 3 or (len(left) == 3 and axes[k].role in ("t", "c")):
             left.remove(k)
+    for k in [k for k in left if axes[k].size == 1]:
+        if len(left) > 3 + sum(roles[j] in ("t", "c") for j in left):
+            left.remove(k)
     listing = ", ".join(map(str, axes)) or "none"
     odd = [k for k in left if axes[k].role in ("t", "c")]
     if not odd and len(left) == 4:

@@ -112,7 +112,7 @@ def laid(mask: Volume, volume: Volume) -> Volume | None:
 def metres(unit: str) -> float | None:
     """Return the length of a unit in metres, None for a name that is not a unit of length."""
     word = unit.strip().replace("\u03bc", "µ")
-    singular = word.lower().rstrip("s") if len(word) > 3 else ""  # "ms" is milliseconds
+    singular = word.lower().rstrip("s") if len(word) > 2 else ""  # "ms" is milliseconds
     return next((_LENGTHS[w] for w in (word, word.lower(), singular) if w in _LENGTHS), None)
 
 

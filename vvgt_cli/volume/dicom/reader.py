@@ -347,7 +347,9 @@ def _geometry(
     """
     first = slices[0]
     normal = np.cross(*first.rows)
-    if len(slices) == 1 and options.dims is None:
+    if len(slices) == 1:
+        if options.dims is not None:
+            raise UsageError(f"{path}: one slice; leave out --dims")
         thickness = float(first.header.get("SliceThickness") or first.spacing[0])
         return options.spacing_or((*first.spacing, thickness)), _direction(first, normal), None
     positions = np.array([s.position for s in slices])

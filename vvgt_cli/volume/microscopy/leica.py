@@ -72,6 +72,7 @@ def _picture(image: Any, path: Path) -> Micrograph:
     values = np.transpose(stored, [axes.index(a) for a in ("T", "C", "S", "Z", "Y", "X")])
     times, channels, samples, nz, ny, nx = values.shape
     stored_as = image.xml_element.findall("./Data/Image/ImageDescription/Channels/ChannelDescription")
+    stored_as.sort(key=lambda one: int(one.get("BytesInc") or 0))
     if samples == 3 and [one.get("ChannelTag") for one in stored_as][:3] == ["3", "2", "1"]:  # blue, green, red
         values = values[:, :, ::-1]
 

@@ -154,7 +154,10 @@ def picture_planes(files: list[Path], options: ReadOptions, source: str) -> Call
 
     def plane(path: Path) -> np.ndarray:
         pixels = read_pixels(path) if count > 1 else _simplest(read_pixels(path))
-        pixels = np.repeat(pixels, 3, axis=2) if pixels.shape[2] == 1 and count == 3 else pixels
+        if pixels.shape[2] == 1 and count > 1:
+            grey = np.repeat(pixels, 3 if count > 2 else 1, axis=2)
+            full = np.full_like(pixels, np.iinfo(pixels.dtype).max)
+            pixels = grey if count == 3 else np.concatenate([grey, full], axis=2)
         if pixels.shape[2] < count or (count == 1 and pixels.shape[2] > 1):
             has = f"{path}: {pixels.shape[2]} components (colours, opacity)"
             raise DataError(f"{has}; expected {count} as in other pictures of {source}: convert it, or leave it out")
