@@ -111,7 +111,9 @@ class LiveFacts:
             return [line for layer in self.layers for line in (layer.title(), *layer.lines())]
         dims = " ".join(map(str, self.dims))
         named = (("unit", self.unit), ("quantity", self.quantity))
-        texts = ((word, text if text.isascii() and text[0] != QUOTE else json.dumps(text)) for word, text in named if text)
+        texts = (
+            (word, text if text.isascii() and text[0] != QUOTE else json.dumps(text)) for word, text in named if text
+        )
         unit = [f"comment vvgt live {word} {text}" for word, text in texts]
         values = f"comment vvgt live values {self.lo!r} {self.hi!r} dims {dims}"
         if self.labels:
