@@ -173,8 +173,8 @@ class Clouds(Mapping[str, Result]):
         shown = []
         for cloud in self.clouds:
             other = cloud.recolor(look, **how)
-            made = {"gaussians": other.gaussians, "report": other.report, "ply": other.ply}
-            shown.append(replace(cloud, **made, directions=None, held=None))  # whose look is the old one
+            dropped = replace(cloud, directions=None, held=None)  # values come with the old look
+            shown.append(replace(dropped, gaussians=other.gaussians, report=other.report, ply=other.ply))
         return replace(self, clouds=shown)
 
     def _page(self, path: str, story: StoryLike | None, overwrite: bool, how: dict[str, Any]) -> int:
