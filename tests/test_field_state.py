@@ -4,8 +4,10 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import nibabel
 import numpy as np
 import pytest
+import tifffile
 
 import vvgt_cli as vvgt
 from vvgt_cli.field.open import FieldNeeds, _settings
@@ -79,3 +81,34 @@ def test_a_mask_in_memory_hides_a_file_in_blocks(layers: list[str], tmp_path: Pa
         ends.append(vvgt.read_ply(file)[0].means[:, 0].max())
     assert ends[0] == pytest.approx(ends[1], abs=1e-5)
     assert ends[0] < 0
+
+
+@pytest.mark.parametrize("kind", ["space", "unit", "colours"])
+def test_a_layer_that_is_moved_or_coloured_is_drawn_in_blocks_as_in_memory(kind: str, tmp_path: Path) -> None:
+    z, y, x = np.meshgrid(*[np.linspace(-1, 1, 24)] * 3, indexing="ij")
+    ball = np.exp(-6 * ((x - 0.3) ** 2 + (y + 0.2) ** 2 + z**2)).astype(np.float32)
+    for name, values in (("first", ball), ("other", ball[::-1])):
+        nibabel.save(nibabel.Nifti1Image(values.T, np.diag([0.5, 0.5, 0.5, 1.0])), tmp_path / f"{name}.nii")
+    source: str | Volume = str(tmp_path / "first.nii")
+    layer, reading = f"{tmp_path / 'other.nii'},tf=hot", {}
+    if kind == "space":
+        reading = {"space": "LPS"}
+    elif kind == "unit":
+        source = Volume(ball, spacing=(0.5, 0.5, 0.5), unit="mm")
+        head = "NRRD0004\ntype: float\ndimension: 3\nsizes: 24 24 24\nendian: little\nencoding: raw\n"
+        head += 'space dimension: 3\nspace units: "um" "um" "um"\nspace origin: (0,0,0)\n'
+        head += "space directions: (500,0,0) (0,500,0) (0,0,500)\n\n"
+        (tmp_path / "other.nrrd").write_bytes(head.encode() + ball[::-1].astype("<f4").tobytes())
+        layer = f"{tmp_path / 'other.nrrd'},tf=hot"
+    else:
+        rgb = np.repeat((255 * ball[..., None]).astype(np.uint8), 3, 3)
+        tifffile.imwrite(tmp_path / "c.tif", rgb, photometric="rgb")
+        np.save(tmp_path / "first.npy", ball)
+        source, layer = str(tmp_path / "first.npy"), str(tmp_path / "c.tif")
+    pictures = []
+    for blocks in (None, 16):
+        look = vvgt.Look("gray:0.2,1", layers=[layer])
+        vvgt.render(source, tmp_path / f"{blocks}", look=look, orbit=1, size=48, blocks=blocks, **reading)
+        pictures.append(read_png(next((tmp_path / f"{blocks}").glob("*.png"))))
+    assert pictures[0].max() > 0.1
+    np.testing.assert_allclose(*pictures, atol=0.01)

@@ -213,8 +213,10 @@ def _run(batch: Batch, files: Files | None, console: Console) -> Clouds:
             except NothingVisible:
                 if batch.kind != FRAMES:
                     raise
-                run.console.progress(f"skipped: {item.name} (nothing of it is visible)")
                 batch.facts["empty"] = sorted({*batch.facts["empty"], item.facts["frame"]})
+                if len(batch.facts["empty"]) == len(batch.stems):
+                    raise
+                run.console.progress(f"skipped: {item.name} (nothing of it is visible)")
                 continue
             if conversion.report.interrupted:
                 raise KeyboardInterrupt

@@ -12,13 +12,13 @@ import numpy as np
 
 from vvgt_cli.conversion.batch import Batch, Item
 from vvgt_cli.conversion.index import FRAMES, frame_facts, index_path
-from vvgt_cli.conversion.manifest import Shard
+from vvgt_cli.conversion.manifest import Shard, file_digest
 from vvgt_cli.conversion.place import up_axis
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import DataError, SeveralComponents, UsageError
 from vvgt_cli.field.digests import digest, volume_digest
 from vvgt_cli.field.layered import ALL, OpenedFile, functions_of, open_content
-from vvgt_cli.field.open import automatic, layer_facts
+from vvgt_cli.field.open import automatic, facts_of
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.files import read_text
 from vvgt_cli.gaussians.formats import is_page
@@ -176,7 +176,7 @@ class FrameSeries(Batch):
                 continue
             console.progress(f"{step.label()}: frame {k + 1} of {len(self._steps)}")
             yield Item(step.name, stem, replace(self.request, source=source), {"frame": k, **step.facts()})
-            done += 1
+            done += k not in self.facts["empty"]
         console.message(f"{done} frames converted, {mine - done} were complete before")
 
     def settings(self) -> dict[str, Any]:
@@ -192,7 +192,7 @@ class FrameSeries(Batch):
             "volume": survey.content,
             "frames": survey.count,
             "function": digest(*looks),
-            **({"layers": list(map(layer_facts, request.source.layers))} if request.source.layers else {}),
+            **({"layers": list(map(_layer_facts, request.source.layers))} if request.source.layers else {}),
             "opacity_unit_distance": self._distance,
             **({} if lighting is None else {"light": lighting.key()}),
             **({"live": True} if request.live else {}),
@@ -207,6 +207,13 @@ class FrameSeries(Batch):
             "place": [grid.space, *grid.affine[:3].ravel().tolist()],
             "outputs": [os.path.relpath(p, folder) for p in (request.output, request.report, request.preview) if p],
         }
+
+
+def _layer_facts(layer: SourceRequest) -> list[Any]:
+    """Return what a layer depends on: files by their content."""
+    own = (layer.volume, layer.tf, layer.labels)
+    facts = [file_digest(Path(x)) if isinstance(x, str) and os.path.isfile(x) else facts_of(x) for x in own]
+    return [digest(replace(layer, volume="", tf=None, labels=None)), *facts]
 
 
 def is_glob_of_volumes(source: SourceRequest) -> bool:

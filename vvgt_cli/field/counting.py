@@ -130,20 +130,21 @@ class BlockAccess(Access):
         self._done: dict[int, tuple[CountBlocks, Tally, Statistics]] = {}
         self._count = 0
 
-    def open(self, source: str | Volume | OpenedFile, read: ReadOptions) -> OpenedFile:
-        """Open a file without reading its values, or accept content in memory."""
+    def open(self, source: str | Volume | OpenedFile, read: ReadOptions, other: Volume | None = None) -> OpenedFile:
+        """Open a file without reading its values, or accept content in memory; see `Access.open`."""
         if not isinstance(source, str):
-            content = content_of(source)
+            content = content_of(source).beside(other)
             for volume in (*content.volumes, *content.classified):
                 self._places[id(volume)] = volume, VolumeOrigin(volume, read)
             return content
         read = replace(read, stored=True, packed=True)
-        content = open_content(source, read)
+        there = other and replace(other, data=np.zeros((1, 1, 1), np.uint8), slope=1.0, intercept=0.0)  # for workers
+        content = open_content(source, read).beside(there)
         for number, volume in enumerate(content.volumes):
-            self._places[id(volume)] = volume, VolumeOrigin(source, read, number)
+            self._places[id(volume)] = volume, VolumeOrigin(source, read, number, there)
         if content.color:
             volume = content.classified[0]
-            self._places[id(volume)] = volume, VolumeOrigin(source, read, CLASSIFIED)
+            self._places[id(volume)] = volume, VolumeOrigin(source, read, CLASSIFIED, there)
         return content
 
     def place(self, volume: Volume) -> VolumeOrigin:

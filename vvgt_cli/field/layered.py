@@ -30,6 +30,7 @@ from vvgt_cli.volume.components import channel_numbers
 from vvgt_cli.volume.examples import tissues
 from vvgt_cli.volume.label_maps import labels_in, recognised
 from vvgt_cli.volume.segments import Segment
+from vvgt_cli.volume.space import beside
 from vvgt_cli.volume.stored import Stored, chunks_of, loaded, read_block
 
 if TYPE_CHECKING:
@@ -94,10 +95,15 @@ class OpenedFile:
 
     def loaded(self) -> OpenedFile:
         """Return the same content, with lazily computed arrays loaded into memory."""
-        volumes = tuple(map(loaded, self.volumes))
-        return (
-            self if all(a is b for a, b in zip(volumes, self.volumes, strict=True)) else replace(self, volumes=volumes)
-        )
+        return self._of(tuple(map(loaded, self.volumes)))
+
+    def beside(self, other: Volume | None) -> OpenedFile:
+        """Return the same content in the space and unit of another volume, if there is one; see `space.beside`."""
+        return self if other is None else self._of(tuple(beside(volume, other) for volume in self.volumes))
+
+    def _of(self, volumes: tuple[Volume, ...]) -> OpenedFile:
+        same = all(a is b for a, b in zip(volumes, self.volumes, strict=True))
+        return self if same else replace(self, volumes=volumes)
 
     def prepare(self) -> None:
         """Compute a scalar field's statistics and layout once, instead of once per function."""
@@ -112,11 +118,11 @@ class Access:
         """Begin without statistics; those of the last volume are kept."""
         self._last: tuple[Volume, Statistics] | None = None
 
-    def open(self, source: str | Volume | OpenedFile, read: ReadOptions) -> OpenedFile:
-        """Open a file, or content that is already open."""
+    def open(self, source: str | Volume | OpenedFile, read: ReadOptions, other: Volume | None = None) -> OpenedFile:
+        """Open a file, or content that is already open, in the space and unit of an ``other`` volume."""
         if isinstance(source, str):
-            return open_content(source, read)
-        content = content_of(source).loaded()
+            return open_content(source, read).beside(other)
+        content = content_of(source).loaded().beside(other)
         if content is source and content.single_volume:
             self._last = content.volumes[0], content.statistics
         return content

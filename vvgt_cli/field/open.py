@@ -204,16 +204,17 @@ def _resolved(request: SourceRequest, options: BlockOptions, size: int) -> tuple
     if path == "-" or (os.path.exists(path) and not (os.path.isfile(path) or os.path.isdir(path))):
         raise UsageError(f"{path}: a pipe, which can only be read once; expected a file to read in blocks")
     absolute = _absolute(path)
+    read, message = _at_level(request.read, absolute, options, size)  # none where the level is given, or counts voxels
 
     def at_level(layer: SourceRequest) -> SourceRequest:
         if not isinstance(layer.volume, str):
             return layer
         file = _absolute(layer.volume)
-        read = layer.read if options.level is not None else _at_level(layer.read, file, options, size)[0]
-        return replace(layer, volume=file, read=read)
+        return replace(
+            layer, volume=file, read=_at_level(layer.read, file, options, size)[0] if message else layer.read
+        )
 
     layers = tuple(map(at_level, request.layers))
-    read, message = _at_level(request.read, absolute, options, size)
     if isinstance(read.mask, str):
         read = replace(read, mask=str(Path(read.mask).absolute()))
     return replace(request, volume=absolute, read=read, layers=layers), message
@@ -388,7 +389,7 @@ def _settings(request: SourceRequest, needs: FieldNeeds) -> dict[str, Any]:
         "files": [facts_of(path) for path in request.paths()],
         "read": {one.name: digest(getattr(request.read, one.name)) for one in fields(request.read)},
         "function": [text, request.tf_range, request.unit_distance],
-        "look": [repr(request.light), facts_of(request.labels), *map(layer_facts, request.layers)],
+        "look": [repr(request.light), facts_of(request.labels), *map(_layer_facts, request.layers)],
         "skies": [facts_of(light) for light in request.light.lights if light.lower().endswith(PICTURES)],
         "series": digest(*request.statistics),
         "gaussians": [needs.gaussians, needs.degree, needs.on_disk, needs.values],
@@ -396,7 +397,7 @@ def _settings(request: SourceRequest, needs: FieldNeeds) -> dict[str, Any]:
     }
 
 
-def layer_facts(layer: SourceRequest) -> list[Any]:
+def _layer_facts(layer: SourceRequest) -> list[Any]:
     """Return everything that the look of a layer depends on."""
     return [digest(replace(layer, volume="")), *map(facts_of, (layer.volume, layer.tf, layer.labels))]
 

@@ -30,15 +30,18 @@ class VolumeOrigin:
     Attributes:
         source, read: arguments of `open_content`; or a volume in memory.
         component: number of the component in the file's content, or `CLASSIFIED`.
+        other: a volume in whose space and unit it is, without its values; None for its own.
     """
 
     source: str | Volume
     read: ReadOptions
     component: int = 0
+    other: Volume | None = None
 
     def volume(self) -> Volume:
         """Return the volume, opened once per process."""
         content = _opened(self.source, self.read) if isinstance(self.source, str) else content_of(self.source)
+        content = content.beside(self.other)
         return content.classified[0] if self.component == CLASSIFIED else content.volumes[self.component]
 
 

@@ -19,7 +19,6 @@ from vvgt_cli.look.histogram import UNIT_SHARE
 from vvgt_cli.look.labels import AUTO, NO_LABELS, LabelTable, check_labels, palette
 from vvgt_cli.look.lighting import Lighting, LightOptions
 from vvgt_cli.volume import ReadOptions, Statistics, Volume
-from vvgt_cli.volume.space import beside
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
@@ -346,13 +345,12 @@ def _styled(
     layers = layers_of(content, tf, request.labels, tf_range, request.unit_distance, request.statistics, access)
     for other in request.layers:
         try:
-            inner = access.open(other.volume, other.read)
+            inner = access.open(other.volume, other.read, content.volumes[0])
         except SeveralSteps as error:  # a layer's time steps are not frames
             name, last = getattr(other.volume, "name", other.volume), error.steps - 1
             raise UsageError(
                 f"{name}: {error.steps} time steps; expected one per layer: --layer FILE,time=N (0 to {last})"
             ) from None
-        inner = replace(inner, volumes=tuple(beside(volume, content.volumes[0]) for volume in inner.volumes))
         layers += layers_of(inner, other.tf, other.labels, other.tf_range, other.unit_distance, access=access)
     if request.layers:  # a frame's labels keep their looks: colours of its whole series are in use
         frames = bool(request.statistics) and isinstance(layers[0].tf, LabelTable)
