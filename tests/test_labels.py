@@ -460,8 +460,8 @@ def test_a_fourth_channel_in_json_is_opacity(tmp_path: Path) -> None:
     listed = '[{"id": 1, "r": 255, "g": 0, "b": 0, "a": 51}, {"id": 2, "color": [0, 255, 0], "alpha": 102}]'
     found = read_labels(table(tmp_path, listed, "b.json"))
     assert [(e.color, e.opacity) for e in found.labels] == [((1, 0, 0), 0.2), ((0, 1, 0), 0.4)]
-    for alphas, wanted in (((1, 0.5), [1, 0.5]), ((0, 0), [1, 1])):
-        listed = [{"id": k + 1, "r": 255, "g": 0, "b": 0, "a": a} for k, a in enumerate(alphas)]
+    for alphas, wanted in (((1, 0.5), [1, 0.5]), ((0, 0), [1, 1]), ((255, 1), [1, 1 / 255])):
+        listed = [{"id": k + 1, "r": 255.0, "g": 0.0, "b": 0, "a": a} for k, a in enumerate(alphas)]
         assert [e.opacity for e in read_labels(table(tmp_path, json.dumps(listed), "c.json")).labels] == wanted
 
 

@@ -10,8 +10,10 @@ import netCDF4
 import numpy as np
 import pytest
 import SimpleITK as sitk
+import xarray
 import zarr
 
+import vvgt_cli as vvgt
 from tests.ramps import X, Y, Z, check_grid, ramp
 from tests.refused import refused
 from vvgt_cli.errors import DataError, UsageError
@@ -466,3 +468,9 @@ def test_units_that_are_not_known_are_said(tmp_path: Path) -> None:
         file.createVariable("t", "f4", ("z", "y", "x"))[:] = ramp(X, Y, Z)
     with pytest.warns(UserWarning, match="unit 'parsec' is not a known unit of length; numbers are kept"):
         check_grid(read_volume(str(tmp_path / "v.nc")))
+
+
+def test_a_sheet_is_as_thick_as_its_pixels_are_wide() -> None:
+    values = np.arange(30, dtype=np.float32).reshape(5, 1, 6)
+    at = {"z": 1000.0 * np.arange(5), "y": [3.0], "x": 1000.0 * np.arange(6)}
+    assert vvgt.read_volume(xarray.DataArray(values, dims=("z", "y", "x"), coords=at)).spacing == (1000.0, 1000.0, 1000.0)

@@ -93,7 +93,7 @@ class Files:
         Raises:
             UsageError: outputs that may not be written, or a folder of another series.
         """
-        if self._request.overwrite and self._shard.count > 1:
+        if self._request.overwrite and self.sharded:
             raise UsageError("--overwrite with --shard: shards would remove each other's files; remove the files first")
         self.names(batch, UNKNOWN)
         folder = Path(self._index.path).parent
@@ -154,6 +154,11 @@ class Files:
         if self._manifest is not None:
             self._manifest.record(names, {names[0]: {"row": row}})
 
+    @property
+    def sharded(self) -> bool:
+        """Whether other runs convert some of the items."""
+        return self._shard.count > 1
+
     def finish(self, batch: Batch, console: Console) -> None:
         """Write the index; for shards, of the items recorded so far, so that the last shard lists all."""
         path, manifest, known = self._index.path, self._manifest, -1
@@ -211,7 +216,7 @@ def _run(batch: Batch, files: Files | None, console: Console) -> Clouds:
             try:
                 conversion = convert_one(request, run.console, warm=batch.previous, finished=item.gaussians)
             except NothingVisible:
-                if batch.kind != FRAMES:
+                if batch.kind != FRAMES or (files is not None and files.sharded):  # whose index would not know it
                     raise
                 batch.facts["empty"] = sorted({*batch.facts["empty"], item.facts["frame"]})
                 if len(batch.facts["empty"]) == len(batch.stems):

@@ -176,7 +176,8 @@ class FrameSeries(Batch):
                 continue
             console.progress(f"{step.label()}: frame {k + 1} of {len(self._steps)}")
             yield Item(step.name, stem, replace(self.request, source=source), {"frame": k, **step.facts()})
-            done += k not in self.facts["empty"]
+            empty = k in self.facts["empty"]
+            done, mine = done + (not empty), mine - empty
         console.message(f"{done} frames converted, {mine - done} were complete before")
 
     def settings(self) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from vvgt_cli.conversion.cut import Levels, StoredGaussians
 from vvgt_cli.conversion.level_selection import CutErrors
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.digests import digest
-from vvgt_cli.files import atomic_write, write_bytes
+from vvgt_cli.files import atomic_write, linked, write_bytes
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats.page_file import upright
 from vvgt_cli.gaussians.formats.sog import IMAGES, META, images_of, webp
@@ -67,7 +67,7 @@ def write_levels(
     with run.stage(stage) as record, atomic_write(target, overwrite) as temporary:
         task.forget_changed()
         if stage == "write":
-            target.unlink(missing_ok=True)  # of another run, whose files are replaced
+            linked(target).unlink(missing_ok=True)  # of another run, whose files are replaced
         run_pass(task, stage)
         spreads = stored.field("spreads")
         facts = _levels(task, counts, spreads, errors, choices)

@@ -281,10 +281,11 @@ def table_of(parsed: Any, what: str, pick: str = "") -> LabelTable:
         if pick:
             raise DataError(f"{what}: holds one table; omit #{pick}")
         records = [_record(one, what) for one in parsed]
-        alphas = [entry.pop("alpha") for _, entry in records]
-        for alpha, (_, entry) in zip(alphas, records, strict=True):
-            if alpha is not None and any(alphas):  # FreeSurfer's are all 0
-                entry.setdefault("opacity", min(alpha / 255 if alpha > 1 else alpha, 1))
+        alphas = {key: alpha for key, entry in records if (alpha := entry.pop("alpha")) is not None and int(key)}
+        most = 255 if any(alpha > 1 for alpha in alphas.values()) else 1
+        for key, entry in records:
+            if key in alphas and any(alphas.values()):  # FreeSurfer's are all 0
+                entry.setdefault("opacity", min(alphas[key] / most, 1))
         return _table(_entries(records, what), what)
     if not isinstance(parsed, dict):
         raise DataError(f"{what}: JSON that is no object; {EXPECTED}")
@@ -303,7 +304,7 @@ def _record(one: Any, what: str) -> tuple[str, Any]:
         raise DataError(f"{what}: {str(one)[:40]!r}, without a number; {EXPECTED}")
     color = fields["color"]
     if color is None and all(isinstance(fields[key], int | float) for key in "rgb"):
-        color = [fields[key] for key in "rgb"]
+        color = [int(v) if float(v).is_integer() else v for v in (fields[key] for key in "rgb")]
     entry = {key: value for key, value in (("name", fields["name"]), ("color", color)) if value is not None}
     entry["alpha"] = fields["a"] if isinstance(fields["a"], int | float) else None
     return str(fields["number"]), {key: lower[key] for key in ("opacity", "parents", "visible") if key in lower} | entry

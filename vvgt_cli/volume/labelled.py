@@ -403,8 +403,9 @@ def _placed(
             raise UsageError(f"{source}: {why}; leave out --dims")
         steps = [a.step or 1.0 if c is None or c.size < 2 else float((c[-1] - c[0]) / (c.size - 1))
                  for a, c in zip(axes, centres, strict=True)]  # fmt: skip
-        if field.shape[0] == 1 and not axes[0].step:
-            steps[0] = steps[2]  # a single slice is as thick as its pixels are wide
+        wide = next((s for s, a in zip(steps[::-1], axes[::-1], strict=True) if a.size > 1), 1.0)
+        # a single slice is as thick as its pixels are wide
+        steps = [wide if a.size == 1 and not a.step else s for s, a in zip(steps, axes, strict=True)]
         step = options.spacing or triple(steps[::-1])
         return Volume(field, step, origin, name=name, slope=scaling[0], intercept=scaling[1], unit=unit)
     if options.dims is None:
