@@ -473,4 +473,5 @@ def test_units_that_are_not_known_are_said(tmp_path: Path) -> None:
 def test_a_sheet_is_as_thick_as_its_pixels_are_wide() -> None:
     values = np.arange(30, dtype=np.float32).reshape(5, 1, 6)
     at = {"z": 1000.0 * np.arange(5), "y": [3.0], "x": 1000.0 * np.arange(6)}
-    assert vvgt.read_volume(xarray.DataArray(values, dims=("z", "y", "x"), coords=at)).spacing == (1000.0, 1000.0, 1000.0)
+    sheet = xarray.DataArray(values, dims=("z", "y", "x"), coords=at)
+    assert vvgt.read_volume(sheet).spacing == (1000.0, 1000.0, 1000.0)

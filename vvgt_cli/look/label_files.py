@@ -303,8 +303,9 @@ def _record(one: Any, what: str) -> tuple[str, Any]:
     if not _INTEGER.fullmatch(str(fields["number"])):
         raise DataError(f"{what}: {str(one)[:40]!r}, without a number; {EXPECTED}")
     color = fields["color"]
-    if color is None and all(isinstance(fields[key], int | float) for key in "rgb"):
-        color = [int(v) if float(v).is_integer() else v for v in (fields[key] for key in "rgb")]
+    channels = [v for key in "rgb" if isinstance(v := fields[key], int | float)]
+    if color is None and len(channels) == 3:
+        color = [int(v) if float(v).is_integer() else v for v in channels]
     entry = {key: value for key, value in (("name", fields["name"]), ("color", color)) if value is not None}
     entry["alpha"] = fields["a"] if isinstance(fields["a"], int | float) else None
     return str(fields["number"]), {key: lower[key] for key in ("opacity", "parents", "visible") if key in lower} | entry
