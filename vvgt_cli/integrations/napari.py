@@ -46,9 +46,8 @@ def write(path: str, layers: Sequence[tuple[Any, dict[str, Any], str]]) -> list[
     shown = [layer for layer in (Layer.create(*one) for one in layers) if layer.visible]
     if not shown:
         raise UsageError("no visible layer; show one of those that are saved")
-    steps = max(len(_values(layer)) if _values(layer).ndim == 4 else 1 for layer in shown)
-    timed = [layer for layer in shown if _values(layer).ndim == 4 and len(_values(layer)) > 1]
-    if len({(len(_values(layer)), layer.scale[0], layer.translate[0]) for layer in timed}) > 1:
+    timed = {(len(v), x.scale[0], x.translate[0]) for x in shown if (v := _values(x)).ndim == 4 and len(v) > 1}
+    if len(timed) > 1:
         raise UsageError("layers whose time axes differ; expected the same steps of all, or save them one by one")
     lost = [f"{layer.name}: {', '.join(notes)}" for layer in shown if (notes := _lost(layer, len(shown) > 1))]
     said = [f"not taken from the layers: {'; '.join(lost)}"] if lost else []
@@ -57,7 +56,7 @@ def write(path: str, layers: Sequence[tuple[Any, dict[str, Any], str]]) -> list[
         said.append("napari's 3D view is a mirror image of x, y, z (its depth points to you); the file is not mirrored")
     with warnings.catch_warnings(record=True) as heard:
         warnings.simplefilter("always")
-        results = [_converted(shown, step) for step in range(steps)]
+        results = [_converted(shown, step) for step in range(steps := max((n for n, *_ in timed), default=1))]
     for text in dict.fromkeys([*said, *(str(one.message) for one in heard if one.category is UserWarning)]):
         if window is None:
             warnings.warn(text, stacklevel=2)
