@@ -56,13 +56,13 @@ def write(path: str, layers: Sequence[tuple[Any, dict[str, Any], str]]) -> list[
         said.append("napari's 3D view is a mirror image of x, y, z (its depth points to you); the file is not mirrored")
     with warnings.catch_warnings(record=True) as heard:
         warnings.simplefilter("always")
-        results = [_converted(shown, step) for step in range(steps := max((n for n, *_ in timed), default=1))]
+        results = [_converted(shown, step) for step in range(max((n for n, *_ in timed), default=1))]
     for text in dict.fromkeys([*said, *(str(one.message) for one in heard if one.category is UserWarning)]):
         if window is None:
             warnings.warn(text, stacklevel=2)
         else:  # its dialog keeps Python's warnings to itself
             show_warning(text)
-    if steps == 1:
+    if len(results) == 1:
         results[0].save(path)
         return [path]
     clouds = [
@@ -72,7 +72,7 @@ def write(path: str, layers: Sequence[tuple[Any, dict[str, Any], str]]) -> list[
     suffix = Path(path).suffix
     pattern = path if suffix == ".html" else f"{path.removesuffix(suffix)}_{{:04d}}{suffix}"
     Clouds("frames", shown[0].name, clouds).save(pattern)
-    return list(dict.fromkeys(pattern.format(k) for k in range(steps)))
+    return list(dict.fromkeys(pattern.format(k) for k in range(len(results))))
 
 
 def _converted(layers: Sequence[Any], step: int) -> Any:
