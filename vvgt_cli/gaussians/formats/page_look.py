@@ -98,7 +98,9 @@ def look_entry(values: Values, options: PlyOptions) -> dict[str, Any]:
         warnings.warn("the page lights other looks by a headlight: its own rays know no sky", stacklevel=2)
     steps = options.story.steps if options.story else ()
     first, shown = values.facts[0], {str(step.get("function")) for step in steps}
-    half = np.abs(np.reshape(first["affine"], (3, 4))[:, :3] * first["dims"]).sum(axis=1) * scale / 2
+    edges = np.reshape(first["affine"], (3, 4))[:, :3] * first["dims"]  # (3, 3), a column for each index axis
+    half, lengths = np.abs(edges).sum(axis=1) * scale / 2, np.linalg.norm(edges, axis=0)
+    half[np.abs(edges / lengths).argmax(axis=0)] = lengths * scale / 2  # along the nearest axis of the world
     return {
         "layers": [
             _layer_entry(layer, scale, offered, shown)
