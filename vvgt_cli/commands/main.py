@@ -77,8 +77,8 @@ def _describe(context: click.Context, parameter: click.Parameter, given: bool) -
 def cli() -> None:
     """Convert scientific volumes to 3D Gaussian splats.
 
-    Data goes to standard output, messages to standard error; "-" stands for either stream: raw values, .ply,
-    JSON. Nothing is overwritten without --overwrite. Exit status: 0 success, 1 invalid data, 2 wrong usage, 130
+    Data goes to standard output, messages to standard error; "-" stands for either stream, for raw values, .ply
+    and JSON. Nothing is overwritten without --overwrite. Exit status: 0 success, 1 invalid data, 2 wrong usage, 130
     interrupted.
     """
 

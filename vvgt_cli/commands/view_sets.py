@@ -375,7 +375,7 @@ def write_views(
         DataError: invalid input, or a function that shows nothing.
     """
     if not views or len({view.stem for view in views}) < len(views):
-        raise UsageError(f"cameras: {len(views)}, or two of one name; expected some, each with a name of its own")
+        raise UsageError(f"cameras: got {len(views)}; expected at least one, and no two of one name")
     folders, asked = folders_of(output, list(requests)), list(requests.values())
     rays, shard = rays or Rays(), shard or Shard()
     with ExitStack() as stack:

@@ -204,7 +204,7 @@ def _resolved(request: SourceRequest, options: BlockOptions, size: int) -> tuple
     if path == "-" or (os.path.exists(path) and not (os.path.isfile(path) or os.path.isdir(path))):
         raise UsageError(f"{path}: a pipe, which can only be read once; expected a file to read in blocks")
     absolute = _absolute(path)
-    read, message = _at_level(request.read, absolute, options, size)  # none where the level is given, or counts voxels
+    read, message = _at_level(request.read, absolute, options, size)  # no message: nothing was chosen
 
     def at_level(layer: SourceRequest) -> SourceRequest:
         if not isinstance(layer.volume, str):
